@@ -1,0 +1,268 @@
+"""The `refract` command: words to calls, no logic."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Annotated
+
+import typer
+
+from .errors import RefractError, UsageError
+from .progress import Report, reporting
+from .sequence import Order, render_files
+from .version import __version__
+
+CANCELLED = 3
+
+app = typer.Typer(
+    help="Render USD stages with glass in them, without a GPU or a display.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # the boxes cut long option names off
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"refract {__version__}")
+        raise typer.Exit
+
+
+Version = Annotated[
+    bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+]
+Stage = Annotated[str, typer.Argument(metavar="STAGE", help="The .usd, .usda, .usdc or .usdz file to render.")]
+Out = Annotated[
+    str,
+    typer.Argument(
+        metavar="OUT",
+        help="The picture to write: .exr holds all AOVs, .png, .jpg and .tif hold one. With --frames the file name "
+        "has one ### group, such as shot.###.png, or shot.###.##.png for fractions of a frame.",
+    ),
+]
+Camera = Annotated[
+    str | None,
+    typer.Option(help="Prim path or name of the camera. Without it the stage's choice is taken, as usdrecord does."),
+]
+Frames = Annotated[
+    str,
+    typer.Option(
+        "--frames",
+        "-f",
+        metavar="FRAMESPEC",
+        help="Frames to render: 101, 101:110, 101:110x2, with commas between several. Without it the stage's start.",
+    ),
+]
+ImageWidth = Annotated[
+    int | None, typer.Option("--image-width", "-w", help="Width in pixels. The default is 960.", show_default=False)
+]
+ImageHeight = Annotated[int | None, typer.Option(help="Height in pixels. Without it the camera's aspect decides.")]
+Samples = Annotated[int | None, typer.Option(help="Samples per pixel, 1 to 4096. The default is 4.")]
+Tiers = Annotated[
+    str | None,
+    typer.Option(
+        metavar="LIST",
+        help="Where refraction and reflection look for their colour, in this order, out of screen, ray, probe and "
+        "sky. The default is screen,probe,sky.",
+    ),
+]
+Screen = Annotated[
+    str | None,
+    typer.Option(
+        metavar="march|proxy",
+        help="How the screen tier finds its pixel: march follows the ray through the depth buffer (the default), "
+        "proxy does exactly what HDRP does.",
+    ),
+]
+ModelName = Annotated[
+    str | None,
+    typer.Option(
+        "--model",
+        metavar="none|sphere|box|thin|traced",
+        help="Use this refraction model for every refractive material, whatever the stage says.",
+    ),
+]
+MaxLayers = Annotated[
+    int | None, typer.Option(help="Refractive surfaces along one view ray, 1 to 32. The default is 4; 1 is HDRP.")
+]
+Aovs = Annotated[
+    str,
+    typer.Option(
+        metavar="LIST", help="AOVs to write, with commas between. Without it .exr gets all, other formats the picture."
+    ),
+]
+Purposes = Annotated[
+    str | None,
+    typer.Option(
+        metavar="LIST", help="Purposes to draw besides default, out of render, proxy and guide. The default is render."
+    ),
+]
+Complexity = Annotated[
+    str,
+    typer.Option(
+        metavar="low|medium|high|veryhigh",
+        help="Accepted as in usdrecord. Subdivision is not done yet, and it says so.",
+    ),
+]
+ColorCorrection = Annotated[
+    str,
+    typer.Option(
+        "--color-correction-mode",
+        metavar="disabled|sRGB|openColorIO",
+        help="What colours go through on their way into an 8-bit file. An .exr always holds linear light.",
+    ),
+]
+Exposure = Annotated[float | None, typer.Option(help="Stops of light added to the camera's own exposure.")]
+SettingsPrim = Annotated[
+    str,
+    typer.Option(
+        "--render-settings-prim-path",
+        metavar="PATH",
+        help="RenderSettings prim to take settings from. Without it the one that the stage names; flags win over it.",
+    ),
+]
+Jobs = Annotated[int | None, typer.Option(help="Threads to use; 0, the default, means all cores.")]
+TileSize = Annotated[int | None, typer.Option(hidden=True)]
+SkipExisting = Annotated[bool, typer.Option("--skip-existing", help="Leave pictures that exist as they are.")]
+ProgressMode = Annotated[
+    str,
+    typer.Option(
+        "--progress",
+        metavar="auto|json|none",
+        help="How progress is told on stderr: auto is a bar on a terminal, json is one object per line.",
+    ),
+]
+
+
+@app.callback()
+def refract(version: Version = False) -> None:
+    """Render USD stages with glass in them, without a GPU or a display.
+
+    Exit codes: 0 done, 1 failed, 2 wrong usage, 3 cancelled.
+    """
+
+
+@app.command()
+def render(
+    stage: Stage,
+    out: Out,
+    camera: Camera = None,
+    frames: Frames = "",
+    image_width: ImageWidth = None,
+    image_height: ImageHeight = None,
+    samples: Samples = None,
+    tiers: Tiers = None,
+    screen: Screen = None,
+    model: ModelName = None,
+    max_layers: MaxLayers = None,
+    aovs: Aovs = "",
+    purposes: Purposes = None,
+    complexity: Complexity = "low",
+    color_correction_mode: ColorCorrection = "sRGB",
+    exposure: Exposure = None,
+    render_settings_prim_path: SettingsPrim = "",
+    jobs: Jobs = None,
+    tile_size: TileSize = None,
+    skip_existing: SkipExisting = False,
+    progress: ProgressMode = "auto",
+) -> None:
+    """Render a stage to a picture, or to one picture per frame."""
+    given = {
+        "camera": camera,
+        "image_width": image_width,
+        "image_height": image_height,
+        "samples": samples,
+        "tiers": None if tiers is None else _list(tiers),
+        "screen": screen,
+        "model": model,
+        "max_layers": max_layers,
+        "purposes": None if purposes is None else _purposes(purposes),
+        "exposure": exposure,
+        "jobs": jobs,
+        "tile_size": tile_size,
+    }
+    order = Order(
+        stage=stage,
+        out=out,
+        frames=frames,
+        overrides={name: value for name, value in given.items() if value is not None},
+        settings_prim=render_settings_prim_path,
+        aovs=_list(aovs),
+        color_correction=color_correction_mode,
+        complexity=complexity,
+        skip_existing=skip_existing,
+    )
+    with _outcome(progress) as (report, cancel):
+        render_files(order, report, cancel)
+
+
+def _list(text: str) -> tuple[str, ...]:
+    return tuple(word.strip() for word in text.split(",") if word.strip())
+
+
+def _purposes(text: str) -> tuple[str, ...]:
+    """usdrecord's rule: default is always drawn."""
+    return ("default", *(word for word in _list(text) if word != "default"))
+
+
+@contextmanager
+def _outcome(progress: str) -> Iterator[tuple[Report, Callable[[], bool]]]:
+    """Turn errors into a line on stderr and the exit code, and Ctrl-C into a wish to stop."""
+    try:
+        with reporting(progress) as report, _interrupts() as cancel:
+            try:
+                yield report, cancel
+            except RefractError as error:
+                report.error(str(error))
+                raise typer.Exit(error.exit_code) from error
+            except MemoryError as error:
+                report.error("out of memory; make the picture smaller, or the stage simpler")
+                raise typer.Exit(1) from error
+            except KeyboardInterrupt as error:
+                report.error("cancelled")
+                raise typer.Exit(CANCELLED) from error
+    except UsageError as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(error.exit_code) from error
+
+
+@contextmanager
+def _interrupts() -> Iterator[Callable[[], bool]]:
+    """The first Ctrl-C asks the work to stop at its next chance; a second one stops it where it is."""
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may listen to signals
+        yield lambda: False
+        return
+    asked = threading.Event()
+
+    def on_interrupt(_signal: int, _frame: FrameType | None) -> None:
+        if asked.is_set():
+            raise KeyboardInterrupt
+        asked.set()
+
+    before = signal.signal(signal.SIGINT, on_interrupt)
+    try:
+        yield asked.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def main() -> None:
+    """Entry point of the `refract` command."""
+    try:
+        app(prog_name="refract")
+    except SystemExit as end:
+        if end.code == CANCELLED:  # a thread that still compiles a kernel would hold the process up for a minute
+            sys.stderr.flush()
+            os._exit(CANCELLED)
+        raise
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,295 @@
+"""The plain records that pass through the doors: a stage as arrays, with no handle of any library in it.
+
+Frame of everything here ("engine world"): right-handed, Y up, metres, moved so that the scene's centre is the
+origin. `Scene.stage_from_engine` takes a point back to the stage's own world. Computed in float64, stored in float32.
+Every record pickles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+U32 = NDArray[np.uint32]
+
+
+class Model(IntEnum):
+    """How a material bends light. The order is the value kernels see."""
+
+    NONE = 0
+    SPHERE = 1
+    BOX = 2
+    THIN = 3
+    TRACED = 4
+
+
+class Channel(IntEnum):
+    """Which part of a texture drives an input."""
+
+    R = 0
+    G = 1
+    B = 2
+    A = 3
+    RGB = 4
+
+
+class Wrap(IntEnum):
+    BLACK = 0
+    CLAMP = 1
+    REPEAT = 2
+    MIRROR = 3
+
+
+class Param(IntEnum):
+    """Material inputs that may be a constant, a texture or a primvar. The value is the column in `Material.inputs`."""
+
+    DIFFUSE = 0  # color
+    EMISSIVE = 1  # color, radiance [W sr^-1 m^-2, unitless scale]
+    SPECULAR = 2  # color, F0 in the specular workflow
+    METALLIC = 3
+    ROUGHNESS = 4
+    CLEARCOAT = 5
+    CLEARCOAT_ROUGHNESS = 6
+    OPACITY = 7
+    IOR = 8
+    NORMAL = 9  # vector3, tangent space, already scaled and biased to [-1, 1]
+    OCCLUSION = 10
+    THICKNESS = 11  # [m]
+    TRANSMITTANCE = 12  # color left after `Material.absorption_distance`
+
+
+@dataclass(frozen=True)
+class Texture:
+    """One decoded image. Row 0 is the top of the file (v = 1)."""
+
+    name: str
+    """Where it came from, for messages; also the key under which it was cached."""
+    pixels: NDArray[np.uint8] | F32
+    """shape (H, W, 4), RGBA; uint8 or float32. Missing channels are filled as USD says (a = 1)."""
+    srgb: bool = False
+    """True where uint8 RGB is sRGB-encoded; alpha never is. float32 is always linear."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """What drives one material input: a constant, a texture, or a primvar (first that is set: texture, primvar)."""
+
+    value: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    """The constant; the fallback where a texture or primvar is absent from the mesh. Scalars repeat in all four."""
+    texture: int = -1
+    """Index into `Scene.textures`, or -1."""
+    channel: Channel = Channel.RGB
+    wrap: tuple[Wrap, Wrap] = (Wrap.REPEAT, Wrap.REPEAT)
+    scale: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
+    bias: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    uv_primvar: str = ""
+    """Name of the float2 primvar that gives st (no `primvars:` prefix); '' means the constant `uv_value`."""
+    uv_value: tuple[float, float] = (0.0, 0.0)
+    """st where the mesh has no such primvar (the reader's fallback)."""
+    uv_matrix: tuple[float, float, float, float, float, float] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+    """Row-major 2x3: st' = M @ (s, t, 1), from UsdTransform2d."""
+    primvar: str = ""
+    """Name of the primvar that gives the value itself, or ''."""
+
+
+@dataclass(frozen=True)
+class Material:
+    """One row of the material table: a UsdPreviewSurface with the refraction attributes beside it."""
+
+    name: str
+    """Prim path of the material, or of the prim whose displayColor it stands for."""
+    inputs: tuple[Source, ...]
+    """One `Source` per `Param`, in that order."""
+    model: Model = Model.NONE
+    specular_workflow: bool = False
+    opacity_presence: bool = False
+    """opacityMode = presence: opacity is coverage, not glass."""
+    opacity_threshold: float = 0.0
+    """> 0 cuts out: opaque where opacity >= threshold, absent elsewhere."""
+    absorption_distance: float = 1.0
+    """[m]"""
+    abbe: float = 0.0
+    """Abbe number V_d; 0 means no dispersion."""
+    priority: int = 0
+    """Nested dielectrics: the higher one owns the overlap."""
+
+    @property
+    def refractive(self) -> bool:
+        return self.model is not Model.NONE
+
+    @property
+    def cutout(self) -> bool:
+        """Some of the surface may be absent, so a hit must be looked at before it counts."""
+        return self.opacity_threshold > 0.0 or self.opacity_presence
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles of one prim, in engine world."""
+
+    path: str
+    points: F32
+    """shape (V, 3) [m]"""
+    triangles: U32
+    """shape (T, 3), indices into `points`, counter-clockwise seen from outside (orientation and mirroring applied)."""
+    materials: I32
+    """shape (T,), index into `Scene.materials`, >= 0"""
+    normals: F32 | None = None
+    """shape (T, 3, 3): unit shading normal per triangle corner; None means flat."""
+    primvars: dict[str, F32] = field(default_factory=dict)
+    """name -> shape (T, 3, D) per triangle corner, or (1, 1, D) where constant; D = 1, 2, 3 or 4."""
+    double_sided: bool = False
+    closed: bool = False
+    """Every edge is shared by exactly two triangles of opposite direction."""
+    static: bool = True
+    """Neither geometry nor transform varies in time and `primvars:refract:static` is not 0."""
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A sphere gprim under a uniform scale: traced exactly, never tessellated."""
+
+    path: str
+    centre: tuple[float, float, float]
+    """[m]"""
+    radius: float
+    """[m], > 0"""
+    material: int
+    primvars: dict[str, F32] = field(default_factory=dict)
+    """name -> shape (1, 1, D): constants only."""
+    static: bool = True
+
+
+class LightKind(IntEnum):
+    DISTANT = 0
+    SPHERE = 1
+    RECT = 2
+    DISK = 3
+
+
+@dataclass(frozen=True)
+class Light:
+    """A finite or distant light. Emits along -Z of its own frame, as UsdLux."""
+
+    path: str
+    kind: LightKind
+    radiance: tuple[float, float, float]
+    """color * intensity * 2^exposure * temperature, after `normalize`. For a zero-size (point or zero-angle) light,
+    the intensity [radiance * m^2] or irradiance it is the limit of."""
+    world_from_light: F64 = field(default_factory=lambda: np.eye(4))
+    """shape (4, 4), column vectors, rotation and translation only [m]"""
+    size: tuple[float, float] = (0.0, 0.0)
+    """Rect: width, height [m]; Disk, Sphere: radius [m], 0 (world scale applied); Distant: angle [rad], 0."""
+    diffuse: float = 1.0
+    specular: float = 1.0
+
+
+@dataclass(frozen=True)
+class Environment:
+    """All dome lights of the stage in one latlong map. `None` in the scene means black."""
+
+    pixels: F32
+    """shape (H, W, 3) radiance, row 0 = up (+Y of the dome), OpenEXR latlong: the image centre looks along +Z and
+    u grows towards -X: u = 0.5 - atan2(x, z) / 2 pi, v = acos(y) / pi in the dome's frame."""
+    dome_from_world: F64 = field(default_factory=lambda: np.eye(3))
+    """shape (3, 3), rotates an engine-world direction into the dome's frame."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Looks down -Z, +Y up, in its own frame."""
+
+    path: str
+    world_from_camera: F64
+    """shape (4, 4), column vectors, rotation and translation only [m]"""
+    window: tuple[float, float, float, float]
+    """left, right, bottom, top of the picture: at distance 1 for perspective [unitless], in metres for orthographic.
+    Aperture offsets are in it; its aspect is the camera's own, before conforming to the image."""
+    orthographic: bool = False
+    clipping: tuple[float, float] = (0.01, 1.0e6)
+    """near, far along the camera axis [m]"""
+    exposure_scale: float = 1.0
+    """Linear factor on every colour (UsdGeomCamera.ComputeLinearExposureScale)."""
+
+
+@dataclass(frozen=True)
+class Volume:
+    """A box or sphere with a frame: the influence or the proxy of a probe."""
+
+    world_from_volume: F64
+    """shape (4, 4), rotation and translation only [m] (scale is ignored, as in HDRP)"""
+    sphere: bool
+    extents: tuple[float, float, float]
+    """box: half size [m]; sphere: (radius, radius, radius) [m]"""
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A reflection probe: where it stands, what it sees, where it serves."""
+
+    path: str
+    mode: str
+    """baked, realtime or custom"""
+    capture_point: tuple[float, float, float]
+    """[m]"""
+    influence: Volume
+    proxy: Volume | None
+    """None: infinite (no local correction)."""
+    resolution: int = 128
+    clipping: tuple[float, float] = (0.1, 1000.0)
+    """[m]"""
+    texture: Texture | None = None
+    """The baked or given cubemap; None means capture at render time."""
+    captured: tuple[str, ...] | None = None
+    """Paths of the prims it sees (the `captured` collection); None means everything."""
+    blend_distance: tuple[float, ...] = (0.0,) * 6
+    """+x -x +y -y +z -z [m]"""
+    blend_normal_distance: tuple[float, ...] = (0.0,) * 6
+    face_fade: tuple[float, ...] = (1.0,) * 6
+    importance: int = 1
+    weight: float = 1.0
+    multiplier: float = 1.0
+    fade_distance: float = 10000.0
+    """[m]"""
+
+
+@dataclass(frozen=True)
+class Notice:
+    """Something the reader wants a person to know: what was ignored, replaced or guessed."""
+
+    path: str
+    """Prim path, file or flag it is about."""
+    text: str
+    """One sentence: what, why, what to do."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A stage at one time code."""
+
+    meshes: tuple[Mesh, ...]
+    materials: tuple[Material, ...]
+    spheres: tuple[Sphere, ...] = ()
+    textures: tuple[Texture, ...] = ()
+    lights: tuple[Light, ...] = ()
+    environment: Environment | None = None
+    camera_light: bool = False
+    """The stage has no light at all: one shines from the camera, as in usdrecord."""
+    cameras: tuple[Camera, ...] = ()
+    """Every camera of the stage, by path; the reader puts the one it would choose first."""
+    probes: tuple[Probe, ...] = ()
+    bounds: tuple[tuple[float, float, float], tuple[float, float, float]] = ((-1, -1, -1), (1, 1, 1))
+    """min, max of everything visible [m]"""
+    stage_from_engine: F64 = field(default_factory=lambda: np.eye(4))
+    """shape (4, 4), column vectors: metres in engine world to the stage's own world and units."""
+    metres_per_unit: float = 0.01
+    time_code: float = 0.0
+    name: str = ""
+    """The file it was read from."""
+    notices: tuple[Notice, ...] = ()

@@ -1,0 +1,76 @@
+"""What a person may choose about a render. One record, used by the command line, Python and the service."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from .errors import UsageError
+
+TIERS = ("screen", "ray", "probe", "sky")
+SCREEN_METHODS = ("march", "proxy")
+MODELS = ("none", "sphere", "box", "thin", "traced")
+PURPOSES = ("default", "render", "proxy", "guide")
+MAX_PIXELS = 1 << 28
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderSettings:
+    """Settings of one frame. Checked when made; an error names the field."""
+
+    camera: str = ""
+    """Prim path or name of the camera; '' chooses as usdrecord does."""
+    image_width: int = 960
+    """[pixels]"""
+    image_height: int = 0
+    """[pixels]; 0 follows the camera's aspect."""
+    samples: int = 4
+    """Samples per pixel, 1 .. 4096."""
+    tiers: tuple[str, ...] = ("screen", "probe", "sky")
+    """Order in which refraction and reflection look for their colour."""
+    screen: str = "march"
+    """`march` the opaque depth, or `proxy` exactly as HDRP."""
+    model: str = ""
+    """Overrides every refractive material's model where not ''."""
+    max_layers: int = 4
+    """Refractive surfaces along one view ray, 1 .. 32; 1 is HDRP."""
+    exposure: float = 0.0
+    """Stops added to the camera's own exposure, -64 .. 64."""
+    purposes: tuple[str, ...] = ("default", "render")
+    jobs: int = 0
+    """Threads; 0 means all cores."""
+    tile_size: int = 64
+    """Pixels along a tile's side; rounded up to a multiple of 4. Never changes the picture."""
+
+    def __post_init__(self) -> None:
+        _in_range("image_width", self.image_width, 1, MAX_PIXELS)
+        _in_range("image_height", self.image_height, 0, MAX_PIXELS)
+        if self.image_width * max(self.image_height, 1) > MAX_PIXELS:
+            raise UsageError(
+                f"image size {self.image_width} x {self.image_height} is over {MAX_PIXELS} pixels; make it smaller"
+            )
+        _in_range("samples", self.samples, 1, 4096)
+        _in_range("max_layers", self.max_layers, 1, 32)
+        _in_range("jobs", self.jobs, 0, 4096)
+        _in_range("tile_size", self.tile_size, 1, 65536)
+        _in_range("exposure", self.exposure, -64.0, 64.0)
+        _tokens("tiers", self.tiers, TIERS)
+        _tokens("purposes", self.purposes, PURPOSES)
+        _tokens("screen", (self.screen,), SCREEN_METHODS)
+        if self.model:
+            _tokens("model", (self.model,), MODELS)
+
+
+def _in_range(name: str, value: float, low: float, high: float) -> None:
+    if isinstance(value, bool) or not math.isfinite(value) or not low <= value <= high:
+        raise UsageError(f"{name} is {value}; it must be between {low} and {high}")
+
+
+def _tokens(name: str, chosen: tuple[str, ...], allowed: tuple[str, ...]) -> None:
+    if not chosen:
+        raise UsageError(f"{name} is empty; choose from {', '.join(allowed)}")
+    for token in chosen:
+        if token not in allowed:
+            raise UsageError(f"{name} has '{token}', which is not known; choose from {', '.join(allowed)}")
+    if len(set(chosen)) != len(chosen):
+        raise UsageError(f"{name} names something twice: {','.join(chosen)}")

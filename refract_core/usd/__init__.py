@@ -1,0 +1,1 @@
+"""The only rooms that know USD: stages in, plain arrays out."""

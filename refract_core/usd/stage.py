@@ -1,0 +1,256 @@
+"""A stage on disk to a `Scene`: opened, looked through, and moved into engine world."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdLux, UsdUtils
+
+import schemas
+
+from ..errors import StageError, UsageError
+from ..scene import F64, Mesh, Notice, Scene, Sphere
+from .camera import choose_camera, read_cameras
+from .geometry import Shape, read_shape
+from .lights import read_lights
+from .parts import Bound, Part, Tables, assemble, bind
+from .place import Placed, bounds_of, place, to_mesh, to_sphere
+from .probes import read_probes
+from .skel import posed
+from .textures import read_texture
+from .traverse import Placement, some_of, walk
+
+FALLBACK_METRES_PER_UNIT = 0.01
+_WARNINGS = 20
+
+
+def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
+    """Opens a stage, with the newest content of its files.
+
+    What composition left out is reported by `scene_from_stage`, as notices of the scene.
+
+    Raises:
+        StageError: the file is missing, unreadable, or not USD.
+    """
+    schemas.register()
+    name = os.fspath(path)
+    file = Path(name)
+    if not file.exists():
+        file = Path(name.partition("[")[0])  # "package.usdz[layer.usda]"
+    if not name or not file.exists():
+        raise StageError(f"{name or 'the stage path'}: there is no such file; check the path")
+    if file.is_dir():
+        raise StageError(f"{name}: is a folder; name a .usd, .usda, .usdc or .usdz file in it")
+    with _captured() as heard:
+        try:
+            stage = Usd.Stage.Open(name)
+        except Tf.ErrorException as error:
+            heard.extend(str(part.commentary) for part in error.args)
+            stage = None
+    if stage is None:
+        reason = " ".join(heard[0].split()) if heard else "USD gives no reason"
+        raise StageError(f"{name}: cannot be read as .usd, .usda, .usdc or .usdz: {reason}")
+    with _captured():
+        for layer in stage.GetUsedLayers():  # USD keeps layers in memory; a changed file would show its old content
+            if not layer.anonymous and not layer.dirty:
+                layer.Reload()
+    return stage
+
+
+def time_range(stage: Usd.Stage) -> tuple[float, float]:
+    """First and last time code; an unauthored end equals the start, an unauthored start is 0."""
+    start = float(stage.GetStartTimeCode())
+    return start, float(stage.GetEndTimeCode()) if stage.HasAuthoredMetadata("endTimeCode") else start
+
+
+def load_stage(
+    path: str | os.PathLike[str],
+    *,
+    time_code: float | None = None,
+    purposes: tuple[str, ...] = ("default", "render"),
+    camera: str = "",
+) -> Scene:
+    """Reads a stage at one time.
+
+    Args:
+        time_code: None takes the stage's startTimeCode, or 0 where it has none
+        purposes: which of default, render, proxy and guide are drawn
+        camera: prim path or name of the camera that `Scene.cameras` begins with; '' chooses one
+
+    Raises:
+        StageError: the stage cannot be opened or read, or has no such camera.
+    """
+    return scene_from_stage(open_stage(path), time_code=time_code, purposes=purposes, camera=camera)
+
+
+def scene_from_stage(
+    stage: Usd.Stage,
+    *,
+    time_code: float | None = None,
+    purposes: tuple[str, ...] = ("default", "render"),
+    camera: str = "",
+) -> Scene:
+    """Reads an opened stage at one time; see `load_stage`. The stage is not changed."""
+    if time_code is not None and not math.isfinite(time_code):
+        raise UsageError(f"time_code is {time_code}; it must be a finite number")
+    time = Usd.TimeCode(time_range(stage)[0] if time_code is None else time_code)
+    notices = _composition_notices(stage)
+    with _captured():  # composing again repeats the same warnings
+        stage = posed(stage, time, notices)
+    with _captured() as heard:
+        try:
+            scene = _read(stage, time, purposes, camera, notices)
+        except Tf.ErrorException as error:
+            reason = " ".join(str(error.args[0].commentary).split())
+            raise StageError(f"{stage.GetRootLayer().identifier}: USD cannot read it: {reason}") from error
+    warnings = dict.fromkeys(" ".join(text.split()) for text in heard)
+    notices.extend(Notice(scene.name, f"USD says: {text}") for text in list(warnings)[:_WARNINGS])
+    return replace(scene, notices=tuple(dict.fromkeys(notices)))
+
+
+@contextmanager
+def _captured() -> Iterator[list[str]]:
+    """Takes USD's warnings away from stderr; they are in the list once the block is left."""
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()
+    heard: list[str] = []
+    try:
+        yield heard
+    finally:
+        heard.extend(str(diagnostic.commentary) for diagnostic in delegate.TakeUncoalescedDiagnostics())
+
+
+def _composition_notices(stage: Usd.Stage) -> list[Notice]:
+    """What composition could not bring together: missing references, payloads, sublayers."""
+    root = stage.GetRootLayer().identifier
+    found = []
+    for error in stage.GetCompositionErrors():
+        prim = error.rootSite.path
+        where = root if prim in (Sdf.Path.emptyPath, Sdf.Path.absoluteRootPath) else str(prim)
+        text = " ".join(str(error).split())
+        found.append(Notice(where, f"part of the stage is missing, the rest is used: {text}"))
+    return found
+
+
+def _read(stage: Usd.Stage, time: Usd.TimeCode, purposes: tuple[str, ...], camera: str, notices: list[Notice]) -> Scene:
+    metres_per_unit = _metres_per_unit(stage, notices)
+    metres_from_stage = _upright(stage, notices) @ np.diag([metres_per_unit] * 3 + [1.0])
+    tables = Tables(time, metres_per_unit, notices)
+    placed = _placed(walk(stage, time, purposes, notices), metres_from_stage, tables)
+    extent = bounds_of(placed)
+    if extent is None:
+        notices.append(Notice("/", "nothing is visible at this time and with these purposes; the scene is empty"))
+        extent = -np.ones(3), np.ones(3)
+    centre = (extent[0] + extent[1]) / 2
+    meshes, spheres = _drawn(placed, centre)
+    engine_from_stage = metres_from_stage.copy()
+    engine_from_stage[:3, 3] = -centre
+    bounds = _corner(extent[0] - centre), _corner(extent[1] - centre)
+    frame: dict[str, Any] = {
+        "engine_from_stage": engine_from_stage,
+        "metres_per_unit": metres_per_unit,
+        "notices": notices,
+    }
+    cameras = choose_camera(stage, time, read_cameras(stage, time, **frame), camera, bounds, notices)
+    lights, environment = read_lights(stage, time, purposes=purposes, **frame)
+    return Scene(
+        meshes=meshes,
+        materials=tuple(tables.materials),
+        spheres=spheres,
+        textures=tuple(tables.textures.values()),
+        lights=lights,
+        environment=environment,
+        camera_light=not _has_light(stage),
+        cameras=cameras,
+        probes=read_probes(stage, time, read_texture=read_texture, **frame),
+        bounds=bounds,
+        stage_from_engine=np.linalg.inv(engine_from_stage).astype(np.float64),
+        metres_per_unit=metres_per_unit,
+        time_code=float(time.GetValue()),
+        name=stage.GetRootLayer().realPath or stage.GetRootLayer().identifier,
+    )
+
+
+def _drawn(placed: list[Placed], centre: F64) -> tuple[tuple[Mesh, ...], tuple[Sphere, ...]]:
+    """Engine world records. Empties `placed`, so that float64 points go as float32 ones come."""
+    meshes: list[Mesh] = []
+    spheres: list[Sphere] = []
+    while placed:
+        item = placed.pop()
+        if item.radius > 0.0:
+            spheres.append(to_sphere(item, centre))
+        else:
+            meshes.append(to_mesh(item, centre))
+    return tuple(reversed(meshes)), tuple(reversed(spheres))
+
+
+def _corner(point: F64) -> tuple[float, float, float]:
+    x, y, z = point.tolist()
+    return x, y, z
+
+
+def _has_light(stage: Usd.Stage) -> bool:
+    return any(prim.HasAPI(UsdLux.LightAPI) for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
+
+
+def _metres_per_unit(stage: Usd.Stage, notices: list[Notice]) -> float:
+    if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
+        return FALLBACK_METRES_PER_UNIT
+    authored = float(stage.GetMetadata(UsdGeom.Tokens.metersPerUnit))  # unlike UsdGeom's call, takes any number type
+    if math.isfinite(authored) and authored > 0.0:
+        return authored
+    text = f"metersPerUnit is {authored:g}; it must be finite and above 0, so {FALLBACK_METRES_PER_UNIT} is used"
+    notices.append(Notice(stage.GetRootLayer().identifier, text))
+    return FALLBACK_METRES_PER_UNIT
+
+
+def _upright(stage: Usd.Stage, notices: list[Notice]) -> F64:
+    """Rotation that takes the stage's up axis to +Y, shape (4, 4); X stays X."""
+    turned = np.eye(4)
+    axis = str(UsdGeom.GetStageUpAxis(stage))
+    if axis == UsdGeom.Tokens.z:
+        turned[1:3, 1:3] = [[0.0, 1.0], [-1.0, 0.0]]
+    elif axis != UsdGeom.Tokens.y:
+        notices.append(Notice(stage.GetRootLayer().identifier, f"upAxis is '{axis}'; it must be Y or Z, so Y is used"))
+    return turned
+
+
+def _placed(placements: list[Placement], metres_from_stage: F64, tables: Tables) -> list[Placed]:
+    """Reads every prim once and puts it wherever it is drawn."""
+    prims = list({placement.prim.GetPath(): placement.prim for placement in placements}.values())
+    shapes: dict[Sdf.Path, Shape | None] = {}
+    parts: dict[Sdf.Path, Part | None] = {}
+    for prim, bound in zip(prims, bind(prims, tables.notices), strict=True):
+        parts[prim.GetPath()] = _part(prim, bound, shapes, tables)
+    cages = [str(path) for path, part in parts.items() if part is not None and part.shape.cage]
+    if cages:
+        text = "subdivision surfaces are drawn as their control cage, with smooth normals: subdivision is not done yet"
+        tables.notices.append(Notice(cages[0], f"{text} ({some_of(cages)})"))
+    placed = []
+    for placement in placements:
+        part = parts[placement.prim.GetPath()]
+        item = place(part, placement, metres_from_stage, tables) if part is not None else None
+        if item is not None:
+            placed.append(item)
+    return placed
+
+
+def _part(prim: Usd.Prim, bound: Bound, shapes: dict[Sdf.Path, Shape | None], tables: Tables) -> Part | None:
+    # Proxies of one native prototype share its geometry; inherited materials and primvars may differ.
+    shared = prim.IsInstanceProxy()
+    key = prim.GetPrimInPrototype().GetPath() if shared else prim.GetPath()
+    try:
+        shape = shapes[key] if key in shapes else read_shape(prim, tables.time, tables.notices)
+        if shared:
+            shapes[key] = shape
+        return assemble(prim, shape, bound, tables) if shape is not None else None
+    except Tf.ErrorException as error:
+        reason = " ".join(str(part.commentary) for part in error.args)
+        tables.notices.append(Notice(str(prim.GetPath()), f"skipped: USD cannot read it: {reason}"))
+        return None

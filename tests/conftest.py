@@ -1,0 +1,21 @@
+"""What every test stands on: the schemas are known to USD before the first stage is made."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import schemas
+
+schemas.register()
+
+_ASSETS = Path(__file__).parents[2] / "shared" / "assets"
+
+
+@pytest.fixture(scope="session")
+def assets() -> Path:
+    """Folder of real stages; tests that need it are skipped where it is absent."""
+    if not _ASSETS.is_dir():
+        pytest.skip("the folder of real stages is not here")
+    return _ASSETS

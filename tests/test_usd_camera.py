@@ -1,0 +1,223 @@
+"""Cameras against USD's own frustum, and the order in which one is chosen."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pxr import Gf, UsdGeom
+from scene_reading import CUBE, F64, read, stage_of, texts, to_stage
+
+from refract_core.errors import StageError
+from refract_core.scene import Camera, Scene
+from refract_core.usd.camera import frame_everything
+from refract_core.usd.stage import scene_from_stage
+
+
+def camera_text(name: str = "Cam", extra: str = "") -> str:
+    return f'def Camera "{name}" {{ {extra} }}\n'
+
+
+def ray(scene: Scene, camera: Camera, x: float, y: float) -> tuple[F64, F64]:
+    """Origin and unit direction in the stage's world through the picture at x, y in -1 .. 1."""
+    left, right, bottom, top = camera.window
+    u, v = left + (right - left) * (x + 1) / 2, bottom + (top - bottom) * (y + 1) / 2
+    if camera.orthographic:
+        start, end = np.array([u, v, 0, 1]), np.array([u, v, -1, 1])
+    else:
+        start, end = np.array([0.0, 0, 0, 1]), np.array([u, v, -1, 1])
+    start, end = (camera.world_from_camera @ point for point in (start, end))
+    start, end = to_stage(scene, start[:3]), to_stage(scene, end[:3])
+    return start, (end - start) / np.linalg.norm(end - start)
+
+
+numbers = st.floats(-1.0, 1.0)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.tuples(st.floats(10, 100), st.floats(5, 50), st.floats(5, 50), st.floats(-9, 9), st.floats(-9, 9)),
+    st.tuples(st.floats(-500, 500), st.floats(-500, 500), st.floats(-500, 500)),
+    st.tuples(st.floats(-180, 180), st.floats(-80, 80), st.floats(-180, 180)),
+    st.booleans(),
+    st.sampled_from(["Y", "Z"]),
+    st.sampled_from([0.01, 1.0]),
+    st.tuples(numbers, numbers),
+)
+def test_rays_are_those_of_usds_frustum(
+    lens: tuple[float, ...],
+    at: tuple[float, ...],
+    turn: tuple[float, ...],
+    orthographic: bool,
+    up: str,
+    unit: float,
+    place: tuple[float, float],
+) -> None:
+    stage = stage_of(
+        CUBE()
+        + camera_text(
+            extra=f"""float focalLength = {lens[0]}
+        float horizontalAperture = {lens[1]}
+        float verticalAperture = {lens[2]}
+        float horizontalApertureOffset = {lens[3]}
+        float verticalApertureOffset = {lens[4]}
+        token projection = "{"orthographic" if orthographic else "perspective"}"
+        double3 xformOp:translate = {at}
+        float3 xformOp:rotateXYZ = {turn}
+        uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateXYZ"]"""
+        ),
+        up=up,
+        unit=unit,
+    )
+    scene = scene_from_stage(stage)
+    frustum = UsdGeom.Camera(stage.GetPrimAtPath("/Cam")).GetCamera(0.0).frustum
+    expected = frustum.ComputePickRay(Gf.Vec2d(*place))
+    origin, direction = ray(scene, scene.cameras[0], *place)
+    assert direction == pytest.approx(np.array(expected.direction.GetNormalized()), abs=1e-5)
+    # USD starts its pick rays on the near plane.
+    offset = np.array(expected.startPoint) - origin
+    assert np.linalg.norm(np.cross(offset, direction)) < 1e-3
+
+
+def test_defaults_are_those_of_usdgeomcamera() -> None:
+    """50 mm, 20.955 x 15.2908 mm, clipping (1, 1000000) scene units."""
+    camera = read(camera_text(), unit=0.01).cameras[0]
+    assert camera.window == pytest.approx((-0.20955, 0.20955, -0.152908, 0.152908), abs=1e-6)
+    assert camera.clipping == pytest.approx((0.01, 1e4))
+    assert camera.exposure_scale == 1.0
+    assert not camera.orthographic
+
+
+def test_an_orthographic_aperture_is_tenths_of_a_scene_unit() -> None:
+    extra = 'token projection = "orthographic"\nfloat horizontalAperture = 40\nfloat verticalAperture = 20'
+    camera = read(camera_text(extra=extra), unit=0.5).cameras[0]
+    assert camera.orthographic
+    assert camera.window == pytest.approx((-1.0, 1.0, -0.5, 0.5))
+
+
+@pytest.mark.parametrize("scale", ["(3, 3, 3)", "(1, 2, 5)", "(-2, -2, -2)"])
+def test_scale_is_no_part_of_a_pose(scale: str) -> None:
+    extra = f"""float3 xformOp:rotateXYZ = (10, 20, 30)
+        double3 xformOp:scale = {scale}
+        uniform token[] xformOpOrder = ["xformOp:rotateXYZ", "xformOp:scale"]"""
+    pose = read(camera_text(extra=extra)).cameras[0].world_from_camera
+    assert pose[:3, :3] @ pose[:3, :3].T == pytest.approx(np.eye(3), abs=1e-9)
+    assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)
+    plain = read(camera_text(extra=extra.replace(scale, "(1, 1, 1)"))).cameras[0].world_from_camera
+    if scale == "(3, 3, 3)":
+        assert pose == pytest.approx(plain)
+
+
+@pytest.mark.parametrize(
+    ("extra", "expected"),
+    [
+        ("float exposure = 1", 2.0),
+        ("float exposure = 1\nfloat exposure:iso = 400", 8.0),
+        ("float exposure:time = 0.01\nfloat exposure:fStop = 2", 0.0025),
+        ("float exposure:responsivity = 3", 3.0),
+    ],
+)
+def test_exposure_follows_its_formula(extra: str, expected: float) -> None:
+    """2^exposure * time * iso / 100 * responsivity / fStop^2: documentation of UsdGeomCamera."""
+    assert read(camera_text(extra=extra)).cameras[0].exposure_scale == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("extra", "name"),
+    [
+        ("float focalLength = 0", "focalLength"),
+        ("float focalLength = nan", "focalLength"),
+        ("float horizontalAperture = -1", "horizontalAperture"),
+        ("float verticalApertureOffset = inf", "verticalApertureOffset"),
+        ("float2 clippingRange = (10, 1)", "clippingRange"),
+        ("float2 clippingRange = (0, 1)", "clippingRange"),
+        ("float exposure:fStop = 0", "exposure"),
+    ],
+)
+def test_impossible_values_are_named_and_replaced(extra: str, name: str) -> None:
+    scene = read(camera_text(extra=extra))
+    camera = scene.cameras[0]
+    assert name in texts(scene, "/Cam")
+    assert np.isfinite(camera.window).all()
+    assert camera.window[0] < camera.window[1]
+    assert camera.window[2] < camera.window[3]
+    assert 0 < camera.clipping[0] < camera.clipping[1]
+    assert 0 < camera.exposure_scale < math.inf
+
+
+def test_depth_of_field_is_named_as_ignored_for_the_camera_in_use() -> None:
+    scene = read(camera_text(extra="float fStop = 2.8") + camera_text("Other", "float fStop = 4"))
+    assert "depth of field is ignored" in texts(scene, "/Cam")
+    assert not texts(scene, "/Other")
+    assert "depth of field" not in texts(read(camera_text(extra="float fStop = 0")), "/Cam")
+
+
+def test_a_camera_without_a_place_is_skipped() -> None:
+    extra = 'double3 xformOp:scale = (0, 0, 0)\nuniform token[] xformOpOrder = ["xformOp:scale"]'
+    scene = read(camera_text(extra=extra))
+    assert "skipped" in texts(scene, "/Cam")
+    assert scene.cameras[0].path == ""
+
+
+# --- which one ------------------------------------------------------------------------------------------------------
+
+SEVERAL = camera_text("b") + camera_text("a") + 'def Xform "X" { ' + camera_text("deep") + " }\n"
+SETTINGS = 'def RenderSettings "R" { rel camera = </b> }\n'
+HEAD = 'renderSettingsPrimPath = "/R"'
+
+
+def test_an_asked_for_camera_comes_first_by_path_or_name() -> None:
+    for wanted in ("/X/deep", "deep"):
+        scene = read(SEVERAL + camera_text("main_cam") + SETTINGS, head=HEAD, camera=wanted)
+        assert scene.cameras[0].path == "/X/deep"
+        assert [camera.path for camera in scene.cameras[1:]] == ["/a", "/b", "/main_cam"]
+
+
+def test_an_unknown_camera_is_an_error_that_lists_the_others() -> None:
+    with pytest.raises(StageError, match=r"'nope' does not exist; the stage has /X/deep, /a, /b"):
+        read(SEVERAL, camera="nope")
+    with pytest.raises(StageError, match="none at all"):
+        read(CUBE(), camera="nope")
+
+
+def test_the_render_settings_come_next_then_main_cam_then_the_first() -> None:
+    main = camera_text("main_cam")
+    assert read(SEVERAL + main + SETTINGS, head=HEAD).cameras[0].path == "/b"
+    assert read(SEVERAL + main).cameras[0].path == "/main_cam"
+    scene = read(SEVERAL)
+    assert scene.cameras[0].path == "/X/deep"
+    assert "/a, /b" in texts(scene, "/X/deep")
+
+
+def test_render_settings_that_name_no_camera_are_passed_over_and_said() -> None:
+    scene = read(SEVERAL + SETTINGS.replace("</b>", "</gone>"), head=HEAD)
+    assert scene.cameras[0].path == "/X/deep"
+    assert "/gone" in texts(scene, "/R")
+
+
+@pytest.mark.parametrize("up", ["Y", "Z"])
+def test_without_a_camera_everything_is_in_the_picture(up: str) -> None:
+    text = CUBE(extra='double3 xformOp:scale = (5, 1, 2)\nuniform token[] xformOpOrder = ["xformOp:scale"]')
+    scene = read(text + 'def Xform "Y" { ' + CUBE() + " }", up=up)
+    assert any("no camera" in notice.text for notice in scene.notices)
+    (camera,) = scene.cameras
+    into = np.linalg.inv(camera.world_from_camera)
+    for mesh in scene.meshes:
+        seen = mesh.points @ into[:3, :3].T + into[:3, 3]
+        depth = -seen[:, 2]
+        assert (depth > camera.clipping[0]).all()
+        assert (depth < camera.clipping[1]).all()
+        assert (np.abs(seen[:, 0] / depth) <= camera.window[1]).all()
+        assert (np.abs(seen[:, 1] / depth) <= camera.window[3]).all()
+
+
+def test_it_stands_where_usdrecord_puts_its_own() -> None:
+    """Half the field of view spans the diagonal of the front face: for a 3 x 4 x 2 box and 50 mm over 20.955 mm that is
+    5 / tan(half) + 1 in front of the centre."""
+    camera = frame_everything(((-1.5, -2, -1), (1.5, 2, 1)))
+    half = math.atan(20.955 / 2 / 50)
+    assert camera.world_from_camera[:3, 3] == pytest.approx((0, 0, 5 / math.tan(half) + 1))
+    assert camera.world_from_camera[:3, :3] == pytest.approx(np.eye(3))
