@@ -89,9 +89,15 @@ def project(view, p):  # type: ignore[no-untyped-def]
 @inlined
 def pixel_point(view, px, py, z):  # type: ignore[no-untyped-def]
     """The world point at a pixel coordinate and z_depth."""
-    origin, d, cosine = pixel_ray(view, px, py)
-    t = z / cosine
-    return (origin[0] + d[0] * t, origin[1] + d[1] * t, origin[2] + d[2] * t)
+    grow = 1.0 if view.orthographic else z
+    x = (view.window[0] + (view.window[1] - view.window[0]) * px / view.size[0]) * grow
+    y = (view.window[3] + (view.window[2] - view.window[3]) * py / view.size[1]) * grow
+    r, u, f, eye = row(view.axes, 0), row(view.axes, 1), row(view.axes, 2), row(view.axes, 3)
+    return (
+        eye[0] + f[0] * z + r[0] * x + u[0] * y,
+        eye[1] + f[1] * z + r[1] * x + u[1] * y,
+        eye[2] + f[2] * z + r[2] * x + u[2] * y,
+    )
 
 
 @inlined

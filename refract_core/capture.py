@@ -17,6 +17,7 @@ from .pointer import Pointer
 from .probes import TEXEL, ProbeTable, capture_rows, empty_table, face_direction, fill_levels, in_order
 from .scene import Camera, Probe, Scene, Texture, Volume
 from .scratch import scratch
+from .tables import prim_of
 
 _MAX_OWN = 8
 """Glass beyond this many things shares capture points with its neighbours."""
@@ -86,8 +87,9 @@ def _mask_of(scene: Scene, probe: Probe, sets: list[frozenset[str] | None]) -> i
     baked = probe.mode != "realtime"
     if probe.captured is None or len(sets) >= _MAX_SETS:
         return OPAQUE_STATIC if baked else OPAQUE
+    wanted = set(probe.captured)
     things = [(m.path, m.static) for m in scene.meshes] + [(s.path, s.static) for s in scene.spheres]
-    seen = frozenset(path for path, static in things if path in set(probe.captured) and (static or not baked))
+    seen = frozenset(prim_of(path) for path, static in things if prim_of(path) in wanted and (static or not baked))
     if seen not in sets:
         sets.append(seen)
     return 1 << (FIRST_CAPTURED_BIT + sets.index(seen))

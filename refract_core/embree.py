@@ -1,7 +1,7 @@
 """Embree 4 through its own C API: the device, one BVH, and the packet queries that kernels call.
 
 The library is the `libembree4` inside the `embreex` wheel; embreex itself is never imported (its wrapper has no masks,
-no packets and one thread per call). `rtcIntersect16` and `rtcOccluded16` are registered as LLVM symbols, so compiled
+no packets and one thread per call). `rtcIntersect8` and `rtcOccluded8` are registered as LLVM symbols, so compiled
 kernels call them directly and can be cached on disk: addresses are looked up by name at load time.
 """
 
@@ -35,7 +35,10 @@ OPAQUE = SOLID | CUTOUT
 OPAQUE_STATIC = SOLID_STATIC | CUTOUT_STATIC
 EVERYTHING = -1
 
-LANES = 16
+LANES = 8
+"""Rays of a packet, a block of 4x2 pixels. Eight is native from AVX2 on; sixteen only with AVX-512, and elsewhere
+Embree takes such a packet apart ray by ray (docs/decisions/packets-of-eight.md)."""
+BLOCK_WIDTH, BLOCK_HEIGHT = 4, 2
 _INVALID = -1  # RTC_INVALID_GEOMETRY_ID as int32
 _COHERENT = 1 << 16  # RTC_RAY_QUERY_FLAG_COHERENT
 _TRIANGLE, _SPHERE_POINT = 0, 50  # RTCGeometryType
@@ -43,15 +46,15 @@ _INDEX, _VERTEX = 0, 1  # RTCBufferType
 _UINT3, _FLOAT3, _FLOAT4 = 0x5003, 0x9003, 0x9004  # RTCFormat
 _ROBUST = 1 << 2  # RTC_SCENE_FLAG_ROBUST
 
-# Rows of RTCRayHit16 (each row is one 32-bit word for sixteen lanes).
+# Rows of RTCRayHit8 (each row is one 32-bit word for eight lanes).
 ORG_X, ORG_Y, ORG_Z, T_NEAR, DIR_X, DIR_Y, DIR_Z, TIME, T_FAR, MASK, RAY_ID, FLAGS = range(12)
 NG_X, NG_Y, NG_Z, HIT_U, HIT_V, PRIM, GEOM, INST, INST_PRIM = range(12, 21)
 _WORDS = 21
 
-_rtc_intersect16 = types.ExternalFunction(
-    "rtcIntersect16", types.void(types.intp, types.intp, types.intp, types.intp)
+_rtc_intersect8 = types.ExternalFunction(
+    "rtcIntersect8", types.void(types.intp, types.intp, types.intp, types.intp)
 )
-_rtc_occluded16 = types.ExternalFunction("rtcOccluded16", types.void(types.intp, types.intp, types.intp, types.intp))
+_rtc_occluded8 = types.ExternalFunction("rtcOccluded8", types.void(types.intp, types.intp, types.intp, types.intp))
 
 
 @cache
@@ -64,7 +67,7 @@ def library() -> ctypes.CDLL:
     try:
         files = metadata.files("embreex") or []
     except metadata.PackageNotFoundError as missing:
-        raise EmbreeError("the embreex package, which brings Embree, is not installed; pip install embreex") from missing
+        raise EmbreeError("embreex, which brings Embree, is not installed; pip install embreex") from missing
     # The wheel repairers of the three platforms name and place the file differently.
     found = [f for f in files if "embree4" in f.name and (".so" in f.name or f.name.endswith((".dylib", ".dll")))]
     if not found:
@@ -89,7 +92,7 @@ def library() -> ctypes.CDLL:
     for name, (result, arguments) in signatures.items():
         function = getattr(lib, name)
         function.restype, function.argtypes = result, arguments
-    for name in ("rtcIntersect16", "rtcOccluded16"):
+    for name in ("rtcIntersect8", "rtcOccluded8"):
         address = ctypes.cast(getattr(lib, name), ctypes.c_void_p).value
         assert address is not None
         llvm.add_symbol(name, address)
@@ -191,36 +194,36 @@ def check_parts(points: NDArray[np.float32], parts: list[Part]) -> None:
 
 
 class Packet(NamedTuple):
-    """Sixteen rays and their hits in Embree's own layout; one per thread."""
+    """Eight rays and their hits in Embree's own layout; one per thread."""
 
     rays: NDArray[np.float32]
-    """shape (21, 16) float32, 64-byte aligned: rows ORG_X .. INST_PRIM"""
+    """shape (21, 8) float32, 64-byte aligned: rows ORG_X .. INST_PRIM"""
     words: NDArray[np.int32]
     """the same memory as int32: MASK, PRIM, GEOM, ..."""
     valid: NDArray[np.int32]
-    """shape (16,) int32: -1 traces the lane, 0 leaves it alone"""
+    """shape (8,) int32: -1 traces the lane, 0 leaves it alone"""
     arguments: NDArray[np.int32]
-    """shape (16,) int32: RTCIntersectArguments"""
-    count: NDArray[np.int64]
+    """shape (8,) int32: RTCIntersectArguments"""
+    tally: NDArray[np.int64]
     """shape (1,) int64: rays traced so far"""
     kept: NDArray[np.int32]
-    """shape (3, 16) int32: where callers at three depths keep `valid` while they trace some lanes again"""
+    """shape (3, 8) int32: where callers at three depths keep `valid` while they trace some lanes again"""
 
 
 def new_packet() -> Packet:
     """A packet on fresh memory, for use by one thread at a time."""
-    memory = np.zeros((_WORDS + 2) * LANES + 16, np.float32)
+    memory = np.zeros((_WORDS + 3) * LANES + 16, np.float32)
     skip = (-memory.ctypes.data % 64) // 4
-    flat = memory[skip : skip + (_WORDS + 2) * LANES]
+    flat = memory[skip : skip + (_WORDS + 3) * LANES]
     ints = flat.view(np.int32)
-    arguments = ints[(_WORDS + 1) * LANES :]
+    arguments = ints[(_WORDS + 1) * LANES :]  # 40 bytes, so two rows
     arguments[1] = -1  # RTC_FEATURE_FLAG_ALL; context, filter and callback stay null
     return Packet(
         rays=flat[: _WORDS * LANES].reshape(_WORDS, LANES),
         words=ints[: _WORDS * LANES].reshape(_WORDS, LANES),
         valid=ints[_WORDS * LANES : (_WORDS + 1) * LANES],
         arguments=arguments,
-        count=np.zeros(1, np.int64),
+        tally=np.zeros(1, np.int64),
         kept=np.zeros((3, LANES), np.int32),
     )
 
@@ -250,15 +253,9 @@ def set_ray(packet, lane, origin, direction, t_near, t_far, mask):  # type: igno
     rays[DIR_X, lane] = direction[0]
     rays[DIR_Y, lane] = direction[1]
     rays[DIR_Z, lane] = direction[2]
-    rays[TIME, lane] = 0.0
     rays[T_FAR, lane] = t_far
     words[MASK, lane] = mask
-    words[RAY_ID, lane] = lane
-    words[FLAGS, lane] = 0
     words[GEOM, lane] = _INVALID
-    words[PRIM, lane] = _INVALID
-    words[INST, lane] = _INVALID
-    words[INST_PRIM, lane] = _INVALID
     packet.valid[lane] = -1
 
 
@@ -267,7 +264,7 @@ def _active(packet):  # type: ignore[no-untyped-def]
     n = 0
     for lane in range(LANES):
         n -= packet.valid[lane]
-    packet.count[0] += n
+    packet.tally[0] += n
     return n
 
 
@@ -277,7 +274,7 @@ def intersect(packet, scene, coherent):  # type: ignore[no-untyped-def]
     if _active(packet) == 0:
         return
     packet.arguments[0] = _COHERENT if coherent else 0
-    _rtc_intersect16(packet.valid.ctypes.data, scene, packet.rays.ctypes.data, packet.arguments.ctypes.data)
+    _rtc_intersect8(packet.valid.ctypes.data, scene, packet.rays.ctypes.data, packet.arguments.ctypes.data)
 
 
 @inlined
@@ -286,4 +283,4 @@ def occluded(packet, scene, coherent):  # type: ignore[no-untyped-def]
     if _active(packet) == 0:
         return
     packet.arguments[0] = _COHERENT if coherent else 0
-    _rtc_occluded16(packet.valid.ctypes.data, scene, packet.rays.ctypes.data, packet.arguments.ctypes.data)
+    _rtc_occluded8(packet.valid.ctypes.data, scene, packet.rays.ctypes.data, packet.arguments.ctypes.data)

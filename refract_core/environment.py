@@ -234,7 +234,7 @@ def _convolve(source: F32, lights: F64, normals: F64, out: F32) -> None:
 @inlined
 def _position(table: EnvironmentTable, d: Vec) -> tuple[float, float]:
     """u in 0 .. 1 and v in 0 .. 1 of a world direction of any length."""
-    x, y, z = transform_direction(table.dome_from_world, d)  # type: ignore[no-untyped-call]
+    x, y, z = transform_direction(table.dome_from_world, d)
     return 0.5 - math.atan2(x, z) / (2.0 * math.pi), math.atan2(math.hypot(x, z), y) / math.pi
 
 

@@ -30,7 +30,7 @@ LEFT, EMBEDDED, LOST = 0, 1, 2
 
 
 class Exits(NamedTuple):
-    """Sixteen rays on their way out. One row per lane."""
+    """Eight rays on their way out. One row per lane."""
 
     on: Any
     model: Any
@@ -51,15 +51,17 @@ class Exits(NamedTuple):
     inside: Any
     """part number of the medium the ray is in, or -1"""
     segment: Any
-    """shape (16,): T_FAR to start with"""
+    """shape (8,): T_FAR to start with"""
+    unanswered: Any
+    """shape (8,): the share of the light from the exit that no tier knew"""
 
 
 def new_exits() -> Exits:
-    """Room for sixteen rays."""
+    """Room for eight rays."""
     z = np.zeros
     return Exits(
         z(LANES, np.int32), z(LANES, np.int32), z(LANES), z(LANES), z((LANES, 3)), z(LANES), z((LANES, 3)),
-        z((LANES, 3)), z(LANES), z((LANES, 3)), z(LANES, np.int32), z(LANES, np.int32), z(LANES),
+        z((LANES, 3)), z(LANES), z((LANES, 3)), z(LANES, np.int32), z(LANES, np.int32), z(LANES), z(LANES),
     )  # fmt: skip
 
 
@@ -94,8 +96,8 @@ def find_exits(exits, block, hits, packet, world, ior):  # type: ignore[no-untyp
 
     Args:
         block: the entries: point, ng, ns (on the viewer's side), wo.
-        hits: shape (16,) part numbers of the entries.
-        ior: shape (16,), the index to use (a colour channel's, under dispersion).
+        hits: shape (8,) part numbers of the entries.
+        ior: shape (8,), the index to use (a colour channel's, under dispersion).
     """
     walks = False
     for lane in range(LANES):
@@ -193,8 +195,7 @@ def _meet(exits, lane, packet, world, ior):  # type: ignore[no-untyped-def]
                 out = reflect(d, scale(hit.ng, -1.0))
         _go_on(exits, lane, hit, out)
     elif inside < 0 and not leaving and g.sheet[part] == 0 and mt.model[m] != Model.THIN.value:
-        exits.ior[lane] = max(1.0, float_input(g, mt, tx, hit, m, Param.IOR.value))
-        ior[lane] = exits.ior[lane]
+        ior[lane] = max(1.0, float_input(g, mt, tx, hit, m, Param.IOR.value))
         exits.absorption_distance[lane] = mt.absorption_distance[m]
         _put(exits.color, lane, color_input(g, mt, tx, hit, m, Param.TRANSMITTANCE.value))
         n = flip_towards(normal_input(g, mt, tx, hit, m), hit.ng)

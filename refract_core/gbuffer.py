@@ -9,7 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .camera import pixel_ray
-from .embree import EVERYTHING, GEOM, HIT_U, HIT_V, LANES, OPAQUE, PRIM, REFRACTIVE, T_FAR, clear, keep_valid, set_ray
+from .embree import (
+    BLOCK_HEIGHT,
+    BLOCK_WIDTH,
+    EVERYTHING,
+    GEOM,
+    HIT_U,
+    HIT_V,
+    LANES,
+    OPAQUE,
+    PRIM,
+    REFRACTIVE,
+    T_FAR,
+    clear,
+    keep_valid,
+    set_ray,
+)
 from .environment import radiance
 from .kernel import inlined, kernel
 from .scene import Model
@@ -45,18 +60,15 @@ class RefractiveLayer(NamedTuple):
     """hit distance along the view ray [m]"""
 
 
-def new_opaque_layer(color: NDArray[np.float32], depth: NDArray[np.float32]) -> OpaqueLayer:
-    """A layer over given colour and depth planes (level 0 of the pyramids)."""
-    h, w = depth.shape
-    return OpaqueLayer(color, depth, np.zeros((h, w, 3), np.float32), np.zeros((h, w), np.float32))
-
-
 def new_refractive_layer(width: int, height: int) -> RefractiveLayer:
-    def plane(dtype: type) -> NDArray[np.float32]:
-        return np.zeros((height, width), dtype)
-
+    """A layer with nothing in it."""
+    shape = (height, width)
     return RefractiveLayer(
-        np.full((height, width), -1, np.int32), plane(np.int32), plane(np.float32), plane(np.float32), plane(np.float32)
+        np.full(shape, -1, np.int32),
+        np.zeros(shape, np.int32),
+        np.zeros(shape, np.float32),
+        np.zeros(shape, np.float32),
+        np.zeros(shape, np.float32),
     )
 
 
@@ -91,7 +103,7 @@ def _note(layer, x, y, packet, lane):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _add_view_ray(packet, view, lane, x, y, near, far, mask):  # type: ignore[no-untyped-def]
+def add_view_ray(packet, view, lane, x, y, near, far, mask):  # type: ignore[no-untyped-def]
     """Put the view ray of a pixel into a lane, from distance `near` (or the near plane) to `far`; keeps no state."""
     origin, direction, cosine = pixel_ray(view, x + 0.5, y + 0.5)
     start = max(near, view.clipping[0] / cosine)
@@ -108,25 +120,26 @@ def opaque_tile(world, view, scratch, tile, sample, layer, first):  # type: igno
         (rays traced, refractive pixels, refractive pixels whose first surface is not one that they enter).
     """
     packet, block, second, far = scratch.packet, scratch.block, scratch.second, scratch.far
-    packet.count[0] = 0
+    packet.tally[0] = 0
     width, height = view.size[0], view.size[1]
     spread = (view.window[1] - view.window[0]) / width * (0.0 if view.orthographic else 1.0)
     entered = left = 0
-    for y0 in range(tile[1], tile[3], 4):
-        for x0 in range(tile[0], tile[2], 4):
+    for y0 in range(tile[1], tile[3], BLOCK_HEIGHT):
+        for x0 in range(tile[0], tile[2], BLOCK_WIDTH):
             clear(packet)
             for lane in range(LANES):
-                x, y = x0 + lane % 4, y0 + lane // 4
+                x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
                 if x < width and y < height:
-                    far[lane] = _add_view_ray(packet, view, lane, x, y, 0.0, math.inf, EVERYTHING)
+                    far[lane] = add_view_ray(packet, view, lane, x, y, 0.0, math.inf, EVERYTHING)
                     block.pixel[lane, 0], block.pixel[lane, 1] = x, y
             intersect_world(packet, world, far, True)
             behind = False
             for lane in range(LANES):
-                x, y = x0 + lane % 4, y0 + lane // 4
-                if packet.valid[lane] == 0 or packet.words[GEOM, lane] < 0:
+                x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
+                if packet.valid[lane] == 0:
                     continue
-                if _is_refractive(world, packet, lane):
+                first.part[y, x] = -1
+                if packet.words[GEOM, lane] >= 0 and _is_refractive(world, packet, lane):
                     behind = True
                     _note(first, x, y, packet, lane)
                     entered += 1
@@ -139,7 +152,7 @@ def opaque_tile(world, view, scratch, tile, sample, layer, first):  # type: igno
                 load_hits(block, packet, world, spread)
             shade(block, second, packet, world, sample, OPAQUE)
             _write_opaque(layer, block, world, view, x0, y0)
-    return packet.count[0], entered, left
+    return packet.tally[0], entered, left
 
 
 @inlined
@@ -150,8 +163,8 @@ def _trace_behind_glass(packet, world, view, x0, y0, far, block, spread):  # typ
     for lane in range(LANES):
         packet.valid[lane] = 0
         if kept[lane] != 0 and packet.words[GEOM, lane] >= 0 and _is_refractive(world, packet, lane):
-            x, y = x0 + lane % 4, y0 + lane // 4
-            far[lane] = _add_view_ray(packet, view, lane, x, y, 0.0, math.inf, OPAQUE)
+            x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
+            far[lane] = add_view_ray(packet, view, lane, x, y, 0.0, math.inf, OPAQUE)
     intersect_world(packet, world, far, True)
     for lane in range(LANES):
         packet.valid[lane] = kept[lane]
@@ -161,7 +174,7 @@ def _trace_behind_glass(packet, world, view, x0, y0, far, block, spread):  # typ
 @inlined
 def _write_opaque(layer, block, world, view, x0, y0):  # type: ignore[no-untyped-def]
     for lane in range(LANES):
-        x, y = x0 + lane % 4, y0 + lane // 4
+        x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
         if x >= view.size[0] or y >= view.size[1]:
             continue
         _, direction, cosine = pixel_ray(view, x + 0.5, y + 0.5)
@@ -188,22 +201,22 @@ def peel_tile(world, view, scratch, tile, depth, previous, layer):  # type: igno
     `layer` may be `previous` itself. Returns (rays traced, pixels found).
     """
     packet, far = scratch.packet, scratch.far
-    packet.count[0] = 0
+    packet.tally[0] = 0
     entered = 0
-    for y0 in range(tile[1], tile[3], 4):
-        for x0 in range(tile[0], tile[2], 4):
+    for y0 in range(tile[1], tile[3], BLOCK_HEIGHT):
+        for x0 in range(tile[0], tile[2], BLOCK_WIDTH):
             clear(packet)
             for lane in range(LANES):
-                x, y = x0 + lane % 4, y0 + lane // 4
+                x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
                 if x >= view.size[0] or y >= view.size[1]:
                     continue
                 if previous.part[y, x] != -1:
                     start = previous.distance[y, x] * (1.0 + 1e-5) + 1e-6
                     _, _, cosine = pixel_ray(view, x + 0.5, y + 0.5)
-                    far[lane] = _add_view_ray(packet, view, lane, x, y, start, depth[y, x] / cosine, REFRACTIVE)
+                    far[lane] = add_view_ray(packet, view, lane, x, y, start, depth[y, x] / cosine, REFRACTIVE)
                 layer.part[y, x] = -1
             entered += _peel_block(world, packet, far, layer, x0, y0)
-    return packet.count[0], entered
+    return packet.tally[0], entered
 
 
 @inlined
@@ -219,7 +232,7 @@ def _peel_block(world, packet, far, layer, x0, y0):  # type: ignore[no-untyped-d
             if packet.words[GEOM, lane] < 0:
                 continue
             if _enters(world, packet, lane):
-                _note(layer, x0 + lane % 4, y0 + lane // 4, packet, lane)
+                _note(layer, x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH, packet, lane)
                 entered += 1
                 continue
             packet.rays[3, lane] = packet.rays[T_FAR, lane] * (1.0 + 1e-5) + 1e-6

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from .bsdf import ggx, smith_visibility
 from .kernel import inlined
 from .scene import LightKind, Scene
-from .vec import add, along, cross, dot, frame, length, lerp, normalize, row, scale, sub
+from .vec import add, cross, dot, frame, length, lerp, normalize, row, scale, sub
 
 CAMERA_LIGHT = 4
 """Kind of the light that stands in where a stage has none: at the eye, without falloff or shadow."""
@@ -83,7 +83,7 @@ def shadow_ray(lights, l, p, u1, u2):  # type: ignore[no-untyped-def] # noqa: E7
     target = centre
     if kind == _RECT:
         target = add(centre, add(scale(x, (2.0 * u1 - 1.0) * s0), scale(y, (2.0 * u2 - 1.0) * s1)))
-    elif s0 > 0.0 and (kind == _DISK or kind == _SPHERE):
+    elif s0 > 0.0 and (kind in (_DISK, _SPHERE)):
         if kind == _SPHERE:  # the disk the sphere shows to p
             x, y = frame(normalize(sub(p, centre)))
         r = s0 * math.sqrt(u1)
@@ -160,7 +160,8 @@ def _sphere_irradiance(p, n, centre, radius):  # type: ignore[no-untyped-def]
     a = math.sqrt(h2 - 1.0)
     b = -a * cos_t / sin_t
     b = min(1.0, max(-1.0, b))
-    return max(0.0, (cos_t * math.acos(b) - a * sin_t * math.sqrt(1.0 - b * b)) / h2 + math.atan(sin_t * math.sqrt(1.0 - b * b) / a))
+    side = math.sqrt(1.0 - b * b)
+    return max(0.0, (cos_t * math.acos(b) - a * sin_t * side) / h2 + math.atan(sin_t * side / a))
 
 
 @inlined
@@ -258,6 +259,6 @@ def highlight(lights, l, p, n, wo, alpha):  # type: ignore[no-untyped-def] # noq
         if n_dot_l > 0.0:
             h = normalize(add(wi, wo))
             wide = min(1.0, a + 0.5 * radius)
-            energy = (a / wide) ** 2
-            value += (1.0 - sharp) * ggx(dot(n, h), a) * energy * smith_visibility(n_dot_v, n_dot_l, a) * n_dot_l * solid
+            lobe = ggx(dot(n, h), a) * (a / wide) ** 2 * smith_visibility(n_dot_v, n_dot_l, a)
+            value += (1.0 - sharp) * lobe * n_dot_l * solid
     return value

@@ -16,13 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .embree import LANES, clear, set_ray
+from .embree import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, clear, set_ray
 from .environment import radiance
 from .kernel import inlined, kernel
 from .scene import Probe
 from .shading import load_hits, shade
 from .tracing import intersect_world
-from .vec import along, dot, length, normalize, row, scale, sub
+from .vec import along, length, normalize, row, scale, sub
 from .volumes import INFINITE_DISTANCE, distance_fade, influence_box, influence_sphere, ray_box, ray_sphere
 
 TEXEL = 5
@@ -264,16 +264,16 @@ def probe_light(table, k, p, d, lod, environment, sky_follows):  # type: ignore[
 def capture_rows(world, table, scratch, k, face, y0, y1, mask, near, far, samples):  # type: ignore[no-untyped-def]
     """Draw rows y0 .. y1 (multiples of 4, border included) of one face of probe `k`. Returns rays traced."""
     packet, block, second, limit = scratch.packet, scratch.block, scratch.second, scratch.far
-    packet.count[0] = 0
+    packet.tally[0] = 0
     res = table.resolution[k]
     stride = res + 2
     centre = row(table.capture, k)
-    for by in range(y0, y1, 4):
-        for bx in range(0, stride, 4):
+    for by in range(y0, y1, BLOCK_HEIGHT):
+        for bx in range(0, stride, BLOCK_WIDTH):
             for sample in range(samples):
                 clear(packet)
                 for lane in range(LANES):
-                    x, y = bx + lane % 4, by + lane // 4
+                    x, y = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
                     if x >= stride or y >= stride:
                         continue
                     block.pixel[lane, 0], block.pixel[lane, 1] = x + stride * face, y + 4099 * (k + 1)
@@ -285,14 +285,14 @@ def capture_rows(world, table, scratch, k, face, y0, y1, mask, near, far, sample
                 load_hits(block, packet, world, 2.0 / res)
                 shade(block, second, packet, world, sample, mask)
                 _keep_texels(table, k, face, bx, by, block, 1.0 / samples)
-    return packet.count[0]
+    return packet.tally[0]
 
 
 @inlined
 def _keep_texels(table, k, face, bx, by, block, share):  # type: ignore[no-untyped-def]
     stride = table.resolution[k] + 2
     for lane in range(LANES):
-        x, y = bx + lane % 4, by + lane // 4
+        x, y = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
         if x >= stride or y >= stride or block.on[lane] == 0:
             continue
         i = table.first[k, 0] + ((face * stride + y) * stride + x) * TEXEL

@@ -19,7 +19,6 @@ from .kernel import inlined, kernel
 class ScreenBuffers(NamedTuple):
     """Level 0 and its pyramids, in flat pools."""
 
-    camera: View
     color: NDArray[np.float32]
     """shape (N, 3): all levels, row by row"""
     color_level: NDArray[np.int64]
@@ -29,7 +28,18 @@ class ScreenBuffers(NamedTuple):
     depth_level: NDArray[np.int64]
     """shape (D, 3)"""
     normal: NDArray[np.float32]
-    """shape (H, W, 3)"""
+    """shape (H, W, 3): geometric, towards the viewer"""
+
+
+class Screen(NamedTuple):
+    """The buffers and the camera that filled them: what the screen tier reads."""
+
+    camera: View
+    color: NDArray[np.float32]
+    color_level: NDArray[np.int64]
+    depth: NDArray[np.float32]
+    depth_level: NDArray[np.int64]
+    normal: NDArray[np.float32]
 
 
 def color_levels(width: int, height: int, blurred: bool) -> NDArray[np.int64]:
@@ -49,16 +59,14 @@ def depth_levels(width: int, height: int) -> NDArray[np.int64]:
     return np.array(levels, np.int64)
 
 
-def new_screen_buffers(view: View, blurred: bool) -> ScreenBuffers:
+def new_screen_buffers(w: int, h: int, blurred: bool) -> ScreenBuffers:
     """Empty pools of the right size; the opaque layer is drawn straight into their level 0."""
-    w, h = int(view.size[0]), int(view.size[1])
     colors, depths = color_levels(w, h, blurred), depth_levels(w, h)
 
     def total(levels: NDArray[np.int64]) -> int:
         return int((levels[:, 1] * levels[:, 2]).sum())
 
     return ScreenBuffers(
-        view,
         np.zeros((total(colors), 3), np.float32),
         colors,
         np.zeros(total(depths), np.float32),

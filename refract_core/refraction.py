@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .embree import LANES, OPAQUE
+from .embree import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, OPAQUE
 from .exits import EMBEDDED, LOST, find_exits, load_medium
 from .gbuffer import view_point
 from .kernel import inlined, kernel
@@ -36,31 +36,39 @@ class Choices(NamedTuple):
 
 
 class LayerResult(NamedTuple):
-    """A composited layer, and what its pixels were made of. All float32, (H, W) or (H, W, C)."""
+    """A composited layer before it is put into the picture. float32, written only where the layer is."""
 
     color: NDArray[np.float32]
-    """radiance of the pixel with this layer in front"""
+    """shape (H, W, 3): radiance of the pixel with this layer in front"""
     alpha: NDArray[np.float32]
     depth: NDArray[np.float32]
+    """shape (H, W) z_depth [m]"""
     normal: NDArray[np.float32]
-    """shading normal, towards the viewer"""
-    ng: NDArray[np.float32]
-    refraction: NDArray[np.float32]
-    """what came through, as it is in the picture"""
-    reflection: NDArray[np.float32]
-    transmittance: NDArray[np.float32]
-    weights: NDArray[np.float32]
-    """(H, W, 5) of what came through: screen, ray, probe, sky, none"""
-    confidence: NDArray[np.float32]
-    thickness: NDArray[np.float32]
-    path_length: NDArray[np.float32]
+    """shape (H, W, 3): geometric normal, towards the viewer"""
 
 
 def new_layer_result(width: int, height: int) -> LayerResult:
-    def plane(channels: int) -> NDArray[np.float32]:
-        return np.zeros((height, width, channels) if channels > 1 else (height, width), np.float32)
+    """Planes of zeros."""
+    return LayerResult(
+        np.zeros((height, width, 3), np.float32),
+        np.zeros((height, width), np.float32),
+        np.zeros((height, width), np.float32),
+        np.zeros((height, width, 3), np.float32),
+    )
 
-    return LayerResult(*(plane(c) for c in (3, 1, 1, 3, 3, 3, 3, 3, 5, 1, 1, 1)))
+
+@kernel
+def put_tile(layer, result, opaque, size, tile):  # type: ignore[no-untyped-def]
+    """Draw a composited layer into the picture (an OpaqueLayer), where it is."""
+    for y in range(tile[1], min(tile[3], size[1])):
+        for x in range(tile[0], min(tile[2], size[0])):
+            if layer.part[y, x] < 0:
+                continue
+            for c in range(3):
+                opaque.color[y, x, c] = result.color[y, x, c]
+                opaque.normal[y, x, c] = result.normal[y, x, c]
+            opaque.depth[y, x] = result.depth[y, x]
+            opaque.alpha[y, x] = max(opaque.alpha[y, x], result.alpha[y, x])
 
 
 @inlined
@@ -70,15 +78,18 @@ def _tan_of_lobe(roughness):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def refract_tile(world, screen, probes, thing_probe, choices, scratch, tile, sample, layer, result):  # type: ignore[no-untyped-def]
-    """Composite `layer` over what `screen` holds, into `result`, over a tile (x0, y0, x1, y1). Returns rays traced."""
+def refract_tile(world, screen, probes, thing_probe, choices, scratch, tile, sample, layer, result, planes, front):  # type: ignore[no-untyped-def]
+    """Composite `layer` over what `screen` holds, into `result`, over a tile (x0, y0, x1, y1). Returns rays traced.
+
+    `front`: this is the nearest layer, whose parts go into `planes`.
+    """
     packet, block, second, third = scratch.packet, scratch.block, scratch.second, scratch.third
     exits, query, parts, ior = scratch.exits, scratch.query, scratch.parts, scratch.ior
     z_self, opacity, through = scratch.z_self, scratch.opacity, scratch.through
-    packet.count[0] = 0
+    packet.tally[0] = 0
     view = screen.camera
-    for y0 in range(tile[1], tile[3], 4):
-        for x0 in range(tile[0], tile[2], 4):
+    for y0 in range(tile[1], tile[3], BLOCK_HEIGHT):
+        for x0 in range(tile[0], tile[2], BLOCK_WIDTH):
             some = _load_entries(block, exits, layer, world, view, choices, x0, y0, parts, z_self, opacity)
             if not some:
                 continue
@@ -100,12 +111,12 @@ def refract_tile(world, screen, probes, thing_probe, choices, scratch, tile, sam
                         if channels == 1 or c == channel:
                             through[lane, c] = query.color[lane, c] * t[c]
                 if channels == 1 or channel == 1:
-                    _note_transmission(result, query, exits, x0, y0)
+                    _note_transmission(planes, front, sample, query, exits, x0, y0)
             _query_reflections(query, block, parts, world)
             ask(query, choices.tiers, False, screen, probes, thing_probe, z_self, block, second, third, packet, world,
                 sample)  # fmt: skip
-            _composite(result, query, exits, block, through, opacity, z_self, x0, y0)
-    return packet.count[0]
+            _composite(result, planes, front, sample, query, exits, block, through, opacity, z_self, x0, y0)
+    return packet.tally[0]
 
 
 @inlined
@@ -113,7 +124,7 @@ def _load_entries(block, exits, layer, world, view, choices, x0, y0, parts, z_se
     """Look at the layer's surface in every pixel of a block. False if there is none."""
     some = False
     for lane in range(LANES):
-        x, y = x0 + lane % 4, y0 + lane // 4
+        x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
         block.on[lane] = exits.on[lane] = 0
         if x >= view.size[0] or y >= view.size[1] or layer.part[y, x] < 0:
             continue
@@ -141,7 +152,7 @@ def _reload(block, exits, layer, world, view, choices, x0, y0):  # type: ignore[
     """Undo what a walk through other media left in `exits`."""
     for lane in range(LANES):
         if block.on[lane] != 0:
-            hit, _, _ = view_point(view, layer, world, x0 + lane % 4, y0 + lane // 4)
+            hit, _, _ = view_point(view, layer, world, x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH)
             load_medium(exits, lane, hit, world, choices.model)
 
 
@@ -161,7 +172,7 @@ def _set_iors(exits, world, layer, x0, y0, ior, channel):  # type: ignore[no-unt
     for lane in range(LANES):
         if exits.on[lane] == 0:
             continue
-        x, y = x0 + lane % 4, y0 + lane // 4
+        x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
         m = material_of(world.geometry, layer.part[y, x], layer.primitive[y, x])
         red, green, blue = channel_iors(exits.ior[lane], float(world.materials.abbe[m]))
         ior[lane] = red if channel == 0 else (green if channel == 1 else blue)
@@ -207,27 +218,37 @@ def _query_reflections(query, block, parts, world):  # type: ignore[no-untyped-d
 
 
 @inlined
-def _note_transmission(result, query, exits, x0, y0):  # type: ignore[no-untyped-def]
+def _note_transmission(planes, front, sample, query, exits, x0, y0):  # type: ignore[no-untyped-def]
+    """What the exits were and which tiers answered, before the query is used again."""
     for lane in range(LANES):
         if query.on[lane] == 0:
             continue
-        x, y = x0 + lane % 4, y0 + lane // 4
-        for k in range(5):
-            result.weights[y, x, k] = max(0.0, query.weight[lane, k])
+        exits.unanswered[lane] = max(0.0, query.weight[lane, 4])
+        if not front:
+            continue
+        x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
+        planes.mask[y, x] += 1.0
+        planes.screen[y, x] += query.weight[lane, 0]
+        planes.ray[y, x] += query.weight[lane, 1]
+        planes.probe[y, x] += query.weight[lane, 2]
+        planes.sky[y, x] += query.weight[lane, 3]
+        planes.none[y, x] += exits.unanswered[lane]
         for c in range(3):
-            result.transmittance[y, x, c] = exits.transmittance[lane, c]
-        result.confidence[y, x] = 0.0 if exits.status[lane] == LOST else query.confidence[lane]
-        result.thickness[y, x] = exits.thickness[lane]
-        result.path_length[y, x] = exits.path_length[lane]
+            planes.transmittance[y, x, c] += exits.transmittance[lane, c]
+        if exits.status[lane] != LOST:
+            planes.confidence[y, x] += query.confidence[lane]
+        if sample == 0:
+            planes.thickness[y, x] = exits.thickness[lane]
+            planes.path_length[y, x] = exits.path_length[lane]
 
 
 @inlined
-def _composite(result, query, exits, block, through, opacity, z_self, x0, y0):  # type: ignore[no-untyped-def]
+def _composite(result, planes, front, sample, query, exits, block, through, opacity, z_self, x0, y0):  # type: ignore[no-untyped-def]
     """(1 - opacity) of the diffuse gives way to what came through; reflection and highlights stay whole."""
     for lane in range(LANES):
         if block.on[lane] == 0:
             continue
-        x, y = x0 + lane % 4, y0 + lane // 4
+        x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
         n, wo = row(block.ns, lane), row(block.wo, lane)
         f = fresnel_dielectric(min(1.0, max(0.0, dot(n, wo))), 1.0 / exits.ior[lane])
         clear_share = (1.0 - opacity[lane]) * (1.0 - f)
@@ -235,11 +256,14 @@ def _composite(result, query, exits, block, through, opacity, z_self, x0, y0):  
             refraction = through[lane, c] * clear_share
             reflection = query.color[lane, c] * f + block.specular[lane, c]
             diffuse = block.emissive[lane, c] + block.albedo[lane, c] * block.diffuse[lane, c] / np.pi
-            result.refraction[y, x, c] = refraction
-            result.reflection[y, x, c] = reflection
             result.color[y, x, c] = refraction + reflection + opacity[lane] * diffuse
-            result.normal[y, x, c] = block.ns[lane, c]
-            result.ng[y, x, c] = block.ng[lane, c]
-        result.alpha[y, x] = 1.0 - result.weights[y, x, 4] * clear_share
+            result.normal[y, x, c] = block.ng[lane, c]
+            if front:
+                planes.refraction[y, x, c] += refraction
+                planes.reflection[y, x, c] += reflection
+                if sample == 0:
+                    planes.normal[y, x, c] = block.ns[lane, c]
+        result.alpha[y, x] = 1.0 - exits.unanswered[lane] * clear_share
         result.depth[y, x] = z_self[lane]
-
+        if front and sample == 0:
+            planes.z_depth[y, x] = z_self[lane]

@@ -21,14 +21,15 @@ from .frame import Frame
 from .gbuffer import OpaqueLayer, RefractiveLayer, new_refractive_layer, opaque_tile, peel_tile
 from .kernel import is_compiled
 from .lights import pack_lights
+from .planes import Planes, add_tile, by_name, finish_of, finish_tile, new_planes
 from .pointer import Pointer
-from .pyramid import ScreenBuffers, blur_level, nearest_levels, new_screen_buffers
-from .refraction import Choices, LayerResult, new_layer_result, refract_tile
+from .pyramid import Screen, ScreenBuffers, blur_level, nearest_levels, new_screen_buffers
+from .refraction import Choices, LayerResult, new_layer_result, put_tile, refract_tile
 from .sampling import pixel_offset
 from .scene import Camera, Model, Param, Scene
+from .scratch import scratch
 from .settings import TIERS, RenderSettings
 from .tables import pack_geometry, pack_materials
-from .scratch import scratch
 from .tracing import world_of
 from .version import __version__
 
@@ -171,80 +172,119 @@ def tiles_of(width: int, height: int, side: int) -> list[Tile]:
 def _draw(
     session: Session, scene: Scene, camera: Camera, settings: RenderSettings, size: tuple[int, int], work: Work
 ) -> tuple[dict[str, NDArray[np.float32]], int]:
-    """All samples, averaged into planes."""
+    """All samples, averaged into planes. Returns the planes by AOV name, and rays traced."""
     order = np.array([TIERS.index(t) for t in settings.tiers], np.int32)
     model = int(Model[settings.model.upper()]) if settings.model else -1
     choices = Choices(order, settings.screen == "proxy", model)
     tiles = tiles_of(*size, settings.tile_size)
-    exposure = camera.exposure_scale * 2.0**settings.exposure
-    total = Accumulator(*size)
+    planes = new_planes(*size)
+    easel = new_easel(size, _is_rough(scene), planes)
     rays = 0
     for sample in range(settings.samples):
         work.progress(0.2 + 0.8 * sample / settings.samples, "image")
         view = view_of(camera, *size, pixel_offset(sample))
-        rays += _draw_sample(session, scene, view, choices, settings.max_layers, tiles, sample, total, work)
-    return total.planes(settings.samples, exposure, scene, view_of(camera, *size)), rays
+        rays += _draw_sample(session, easel, view, choices, settings.max_layers, tiles, sample, work)
+    finish = Pointer(finish_of(scene, settings.samples, camera.exposure_scale * 2.0**settings.exposure))
+    centred, target = Pointer(view_of(camera, *size)), Pointer(planes)
+    work.run(lambda tile: finish_tile(target, centred, finish, tile), tiles)
+    return by_name(planes), rays
+
+
+class Easel(NamedTuple):
+    """Buffers that every sample draws into anew."""
+
+    screen: ScreenBuffers
+    opaque: OpaqueLayer
+    layers: list[RefractiveLayer]
+    result: LayerResult
+    planes: Planes
+
+
+def new_easel(size: tuple[int, int], blurred: bool, planes: Planes) -> Easel:
+    """Allocate for one image size. The opaque layer is level 0 of the screen's pyramids."""
+    width, height = size
+    screen = new_screen_buffers(width, height, blurred)
+    opaque = OpaqueLayer(
+        screen.color[: width * height].reshape(height, width, 3),
+        screen.depth[: width * height].reshape(height, width),
+        screen.normal,
+        np.zeros((height, width), np.float32),
+    )
+    return Easel(screen, opaque, [new_refractive_layer(width, height)], new_layer_result(width, height), planes)
 
 
 def _draw_sample(
-    session: Session, scene: Scene, view: View, choices: Choices, max_layers: int, tiles: list[Tile], sample: int,
-    total: Accumulator, work: Work,
+    session: Session, easel: Easel, view: View, choices: Choices, max_layers: int, tiles: list[Tile], sample: int,
+    work: Work,
 ) -> int:  # fmt: skip
     """One sample of every pixel. Returns rays traced."""
-    width, height = int(view.size[0]), int(view.size[1])
-    world, camera = session.world, Pointer(view)
-    screen = new_screen_buffers(view, _is_rough(scene))
-    color = screen.color[: width * height].reshape(height, width, 3)
-    depth = screen.depth[: width * height].reshape(height, width)
-    opaque = OpaqueLayer(color, depth, screen.normal, np.zeros((height, width), np.float32))
-    layers = [new_refractive_layer(width, height)]
-    behind, first = Pointer(opaque), Pointer(layers[0])
+    world, camera, opaque = session.world, Pointer(view), easel.opaque
+    first, behind = Pointer(easel.layers[0]), Pointer(opaque)
     counts = work.run(lambda tile: opaque_tile(world, camera, scratch(), tile, sample, behind, first), tiles)
     rays = sum(c[0] for c in counts)
     busy = [tile for tile, c in zip(tiles, counts, strict=True) if c[1]]
+    if sample == 0:
+        easel.planes.z_depth[:] = opaque.depth
+        easel.planes.normal[:] = opaque.normal
     inside = [tile for tile, c in zip(tiles, counts, strict=True) if c[2]]
     if inside:  # the eye is in glass there: go on to the first surface entered
-        found = work.run(lambda tile: peel_tile(world, camera, scratch(), tile, depth, first, first), inside)
+        found = work.run(lambda tile: peel_tile(world, camera, scratch(), tile, opaque.depth, first, first), inside)
         rays += sum(c[0] for c in found)
-    while busy and len(layers) < max_layers:
-        layer = new_refractive_layer(width, height)
-        previous, here = Pointer(layers[-1]), Pointer(layer)
-        found = work.run(lambda tile: peel_tile(world, camera, scratch(), tile, depth, previous, here), busy)  # noqa: B023
-        rays += sum(c[0] for c in found)
-        if not any(c[1] for c in found):
-            break
-        layers.append(layer)
-    total.note_opaque(opaque, sample)
-    result = new_layer_result(width, height)
-    for k in reversed(range(len(layers))):
-        if not busy:
-            break
-        rays += _composite_layer(session, screen, opaque, choices, layers[k], result, busy, sample, work)
-    total.note(opaque, layers, result if busy else None, sample)
+    used, peeled = _peel(session, easel, camera, max_layers, busy, work)
+    rays += peeled
+    if sample == 0:
+        for layer in easel.layers[:used]:
+            np.add(easel.planes.layers, layer.part >= 0, out=easel.planes.layers)
+    for k in reversed(range(used if busy else 0)):
+        rays += _composite_layer(session, easel, view, choices, k, busy, sample, work)
+    target = Pointer(easel.planes)
+    work.run(lambda tile: add_tile(target, behind, view.size, tile), tiles)
     return rays
 
 
+def _peel(
+    session: Session, easel: Easel, camera: Pointer, max_layers: int, busy: list[Tile], work: Work
+) -> tuple[int, int]:
+    """Find the layers behind the first. Returns how many layers there are, and rays traced."""
+    rays = 0
+    for k in range(1, max_layers if busy else 1):
+        if k == len(easel.layers):
+            easel.layers.append(new_refractive_layer(*(int(n) for n in camera.record.size)))
+        previous, here = Pointer(easel.layers[k - 1]), Pointer(easel.layers[k])
+        depth = easel.opaque.depth
+        found = work.run(
+            lambda tile: peel_tile(session.world, camera, scratch(), tile, depth, previous, here),  # noqa: B023
+            busy,
+        )
+        rays += sum(c[0] for c in found)
+        if not any(c[1] for c in found):
+            return k, rays
+    return max(1, max_layers), rays
+
+
 def _composite_layer(
-    session: Session, screen: ScreenBuffers, opaque: OpaqueLayer, choices: Choices, layer: RefractiveLayer,
-    result: LayerResult, busy: list[Tile], sample: int, work: Work,
-) -> int:  # fmt: skip
-    """Draw one layer from the screen as it is behind it, then put it into the screen."""
-    if 0 in choices.tiers:
-        jobs: list[Callable[[], Any]] = [lambda: nearest_levels(screen.depth, screen.depth_level)]
-        jobs.append(lambda: [blur_level(screen.color, screen.color_level, k) for k in range(1, len(screen.color_level))])
+    session: Session, easel: Easel, view: View, choices: Choices, k: int, busy: list[Tile], sample: int, work: Work
+) -> int:
+    """Draw layer `k` from the picture as it is behind it, then put it into the picture. Returns rays traced."""
+    screen = easel.screen
+    if TIERS.index("screen") in choices.tiers:
+        blurs = range(1, len(screen.color_level))
+        jobs: list[Callable[[], Any]] = [
+            lambda: nearest_levels(screen.depth, screen.depth_level),
+            lambda: [blur_level(screen.color, screen.color_level, i) for i in blurs],
+        ]
         work.run(lambda job: job(), jobs)
-    buffers, chosen, surface, out = Pointer(screen), Pointer(choices), Pointer(layer), Pointer(result)
+    buffers, chosen = Pointer(Screen(view, *screen)), Pointer(choices)
+    layer, result, planes = Pointer(easel.layers[k]), Pointer(easel.result), Pointer(easel.planes)
     counts = work.run(
         lambda tile: refract_tile(
-            session.world, buffers, session.probes, session.thing_probe, chosen, scratch(), tile, sample, surface, out
+            session.world, buffers, session.probes, session.thing_probe, chosen, scratch(), tile, sample, layer,
+            result, planes, k == 0,
         ),
         busy,
     )
-    here = layer.part >= 0
-    np.copyto(opaque.color, result.color, where=here[..., None])
-    np.copyto(opaque.depth, result.depth, where=here)
-    np.copyto(opaque.normal, result.ng, where=here[..., None])
-    np.copyto(opaque.alpha, np.maximum(opaque.alpha, result.alpha), where=here)
+    picture = Pointer(easel.opaque)
+    work.run(lambda tile: put_tile(layer, result, picture, view.size, tile), busy)
     return sum(counts)
 
 
@@ -255,97 +295,3 @@ def _is_rough(scene: Scene) -> bool:
         if material.refractive and (source.value[0] > 0.0 or source.texture >= 0 or source.primvar):
             return True
     return False
-
-
-class Accumulator:
-    """Sums of colours over samples; data planes keep sample 0, which stands at the pixel's centre."""
-
-    def __init__(self, width: int, height: int) -> None:
-        self.beauty = np.zeros((height, width, 4), np.float32)
-        self.mask = np.zeros((height, width), np.float32)
-        self.layer = new_layer_result(width, height)
-        self.n = np.zeros((height, width, 3), np.float32)
-        self.z = np.zeros((height, width), np.float32)
-        self.layers = np.zeros((height, width), np.float32)
-
-    def note_opaque(self, opaque: OpaqueLayer, sample: int) -> None:
-        """Depth and normal of what lies behind, before glass is drawn over it."""
-        if sample == 0:
-            self.z[:] = opaque.depth
-            self.n[:] = opaque.normal
-
-    def note(
-        self, opaque: OpaqueLayer, layers: list[RefractiveLayer], result: LayerResult | None, sample: int
-    ) -> None:
-        """Add one finished sample."""
-        self.beauty[..., :3] += opaque.color
-        self.beauty[..., 3] += opaque.alpha
-        if result is None:
-            return
-        here = layers[0].part >= 0
-        self.mask += here
-        for mine, new in (
-            (self.layer.refraction, result.refraction),
-            (self.layer.reflection, result.reflection),
-            (self.layer.transmittance, result.transmittance),
-            (self.layer.weights, result.weights),
-        ):
-            np.add(mine, new, out=mine, where=here[..., None])
-        np.add(self.layer.confidence, result.confidence, out=self.layer.confidence, where=here)
-        if sample == 0:
-            np.copyto(self.layer.thickness, result.thickness, where=here)
-            np.copyto(self.layer.path_length, result.path_length, where=here)
-            np.copyto(self.n, result.normal, where=here[..., None])
-            np.copyto(self.z, result.depth, where=here)
-            for layer in layers:
-                self.layers += layer.part >= 0
-
-    def planes(self, samples: int, exposure: float, scene: Scene, view: View) -> dict[str, NDArray[np.float32]]:
-        """AOVs by name. Lengths are in the stage's own units; P and N are in its world."""
-        unit = np.float32(1.0 / scene.metres_per_unit)
-        share = np.float32(1.0 / samples)
-        light = np.float32(exposure / samples)
-        covered = np.maximum(self.mask, 1.0)
-        beauty = self.beauty
-        beauty[..., :3] *= light
-        beauty[..., 3] *= share
-        weights = self.layer.weights / covered[..., None]
-        return {
-            "beauty": beauty,
-            "refraction": self.layer.refraction * light,
-            "reflection": self.layer.reflection * light,
-            "transmittance": self.layer.transmittance / covered[..., None],
-            "N": _stage_normals(self.n, scene),
-            "P": _stage_points(self.z, scene, view),
-            "Z": self.z * unit,
-            "mask": self.mask * share,
-            "thickness": self.layer.thickness * unit,
-            "path_length": self.layer.path_length * unit,
-            "layers": self.layers,
-            "weight.screen": np.ascontiguousarray(weights[..., 0]),
-            "weight.ray": np.ascontiguousarray(weights[..., 1]),
-            "weight.probe": np.ascontiguousarray(weights[..., 2]),
-            "weight.sky": np.ascontiguousarray(weights[..., 3]),
-            "weight.none": np.ascontiguousarray(weights[..., 4]),
-            "confidence": self.layer.confidence / covered,
-        }
-
-
-def _stage_normals(n: NDArray[np.float32], scene: Scene) -> NDArray[np.float32]:
-    rotation = scene.stage_from_engine[:3, :3]
-    rotation = rotation / np.cbrt(abs(np.linalg.det(rotation)))
-    return (n @ rotation.T.astype(np.float32)).astype(np.float32)
-
-
-def _stage_points(z: NDArray[np.float32], scene: Scene, view: View) -> NDArray[np.float32]:
-    """World position of every pixel centre at its z_depth, in the stage's world; 0 where nothing was hit."""
-    h, w = z.shape
-    left, right, bottom, top = view.window
-    x = (left + (right - left) * (np.arange(w) + 0.5) / w)[None, :, None]
-    y = (top + (bottom - top) * (np.arange(h) + 0.5) / h)[:, None, None]
-    r, u, f, eye = view.axes
-    depth = np.where(np.isfinite(z), z, 0.0)[..., None].astype(np.float64)
-    points = eye + f * depth + (x * r + y * u) * (1.0 if view.orthographic else depth)
-    m = scene.stage_from_engine
-    points = points @ m[:3, :3].T + m[:3, 3]
-    return np.where(np.isfinite(z)[..., None], points, 0.0).astype(np.float32)

@@ -16,7 +16,7 @@ from .tiers import Query, new_query
 
 
 class Scratch(NamedTuple):
-    """What one thread needs to draw a 4x4 block of pixels. No kernel finds anything of use in it when it starts."""
+    """What one thread needs to draw a 4x2 block of pixels. No kernel finds anything of use in it when it starts."""
 
     packet: Packet
     block: Block
@@ -25,13 +25,13 @@ class Scratch(NamedTuple):
     exits: Exits
     query: Query
     far: NDArray[np.float64]
-    """shape (16,): T_FAR that each lane started with"""
+    """shape (8,): T_FAR that each lane started with"""
     parts: NDArray[np.int32]
     ior: NDArray[np.float64]
     z_self: NDArray[np.float64]
     opacity: NDArray[np.float64]
     through: NDArray[np.float64]
-    """shape (16, 3)"""
+    """shape (8, 3)"""
 
 
 _THREAD = threading.local()

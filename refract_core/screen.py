@@ -115,7 +115,7 @@ def march(screen, origin, direction):  # type: ignore[no-untyped-def]
 def _other(a, w, cell, level):  # type: ignore[no-untyped-def]
     """Pixel index of the coordinate that does not cross, kept inside the cell it is in."""
     low = cell << level
-    return min(max(int(math.floor(a / w)), low), low + (1 << level) - 1)
+    return min(max(math.floor(a / w), low), low + (1 << level) - 1)
 
 
 @inlined
@@ -123,7 +123,7 @@ def _on_surface(screen, px, py, origin, direction, s):  # type: ignore[no-untype
     """Bilinear colour of the four nearest pixels, leaving out those that show another surface."""
     width, height = int(screen.camera.size[0]), int(screen.camera.size[1])
     x, y = px - 0.5, py - 0.5
-    x0, y0 = int(math.floor(x)), int(math.floor(y))
+    x0, y0 = math.floor(x), math.floor(y)
     _, _, z = project(screen.camera, along(origin, direction, s))
     r = g = b = total = 0.0
     for k in range(4):

@@ -1,6 +1,6 @@
-"""Light leaving opaque surfaces, sixteen hits at a time.
+"""Light leaving opaque surfaces, eight hits at a time.
 
-A `Block` holds what a 4x4 block of pixels (or sixteen rays of any kind) hit. `shade` gives its radiance: emission,
+A `Block` holds what a 4x2 block of pixels (or eight rays of any kind) hit. `shade` gives its radiance: emission,
 lights with shadows, the environment, and one mirror bounce where a surface is smooth enough to show it.
 Every room that needs the colour of an opaque hit calls it: the picture, probes, the ray tier and the reference.
 """
@@ -31,11 +31,11 @@ _SKY, _MIRROR = 1, 2
 
 
 class Block(NamedTuple):
-    """Sixteen opaque hits and the light they send back. One row per lane; `on` says which lanes hold a hit."""
+    """Eight opaque hits and the light they send back. One row per lane; `on` says which lanes hold a hit."""
 
     on: Any
     pixel: Any
-    """shape (16, 2) int64: keys of the sampling sequence"""
+    """shape (8, 2) int64: keys of the sampling sequence"""
     point: Any
     ng: Any
     """geometric normal, on the viewer's side"""
@@ -58,7 +58,7 @@ class Block(NamedTuple):
     distance: Any
     """hit distance [m]; inf where nothing was hit"""
     scratch: Any
-    """shape (4, 16)"""
+    """shape (4, 8)"""
 
 
 def new_block() -> Block:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .kernel import inlined
+from .kernel import inlined, leaf
 from .scene import Channel, Param
 from .textures import sample
 from .vec import add, along, cross, dot, flip_towards, length, normalize, row, scale, sub
@@ -162,9 +162,16 @@ def _textured(geometry, materials, textures, hit, m, i):  # type: ignore[no-unty
     return (r, g, b, a)
 
 
-@inlined
+@leaf
 def color_input(geometry, materials, textures, hit, m, i):  # type: ignore[no-untyped-def]
     """Value of input `i` of material `m` at a hit, as three floats."""
+    if (materials.driven[m] >> i) & 1 == 0:
+        return (float(materials.value[m, i, 0]), float(materials.value[m, i, 1]), float(materials.value[m, i, 2]))
+    return _driven_color(geometry, materials, textures, hit, m, i)
+
+
+@inlined
+def _driven_color(geometry, materials, textures, hit, m, i):  # type: ignore[no-untyped-def]
     value = materials.value[m, i]
     if materials.texture[m, i] >= 0:
         c = _textured(geometry, materials, textures, hit, m, i)
@@ -178,9 +185,16 @@ def color_input(geometry, materials, textures, hit, m, i):  # type: ignore[no-un
     return (c[0] * s[0] + b[0], c[1] * s[1] + b[1], c[2] * s[2] + b[2])
 
 
-@inlined
+@leaf
 def float_input(geometry, materials, textures, hit, m, i):  # type: ignore[no-untyped-def]
     """Value of a scalar input `i` of material `m` at a hit."""
+    if (materials.driven[m] >> i) & 1 == 0:
+        return float(materials.value[m, i, 0])
+    return _driven_float(geometry, materials, textures, hit, m, i)
+
+
+@inlined
+def _driven_float(geometry, materials, textures, hit, m, i):  # type: ignore[no-untyped-def]
     channel = materials.channel[m, i]
     if materials.texture[m, i] >= 0 and channel == Channel.A.value:
         c = _textured(geometry, materials, textures, hit, m, i)
@@ -188,7 +202,7 @@ def float_input(geometry, materials, textures, hit, m, i):  # type: ignore[no-un
     if materials.texture[m, i] >= 0 and channel < Channel.A.value:
         c = _textured(geometry, materials, textures, hit, m, i)
         return c[0] * materials.scale[m, i, channel] + materials.bias[m, i, channel]
-    return color_input(geometry, materials, textures, hit, m, i)[0]
+    return _driven_color(geometry, materials, textures, hit, m, i)[0]
 
 
 @inlined

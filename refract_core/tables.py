@@ -65,6 +65,8 @@ class MaterialTable(NamedTuple):
     uv_value: NDArray[np.float32]
     uv_matrix: NDArray[np.float32]
     primvar_slot: NDArray[np.int32]
+    driven: NDArray[np.int32]
+    """shape (M,): bit i is set where a texture or primvar drives input i"""
     model: NDArray[np.int32]
     """shape (M,), as `scene.Model`"""
     specular_workflow: NDArray[np.uint8]
@@ -97,6 +99,7 @@ def pack_materials(materials: Sequence[Material], slots: dict[str, int]) -> Mate
         uv_value=column(lambda s: s.uv_value, np.float32),
         uv_matrix=column(lambda s: s.uv_matrix, np.float32),
         primvar_slot=column(lambda s: slots.get(s.primvar, -1), np.int32),
+        driven=per_material(_driven, np.int32),
         model=per_material(lambda m: int(m.model), np.int32),
         specular_workflow=per_material(lambda m: m.specular_workflow, np.uint8),
         presence=per_material(lambda m: m.opacity_presence, np.uint8),
@@ -105,6 +108,10 @@ def pack_materials(materials: Sequence[Material], slots: dict[str, int]) -> Mate
         absorption_distance=per_material(lambda m: m.absorption_distance, np.float32),
         abbe=per_material(lambda m: m.abbe, np.float32),
     )
+
+
+def _driven(material: Material) -> int:
+    return sum(1 << i for i, source in enumerate(material.inputs) if source.texture >= 0 or source.primvar)
 
 
 def primvar_slots(materials: Sequence[Material]) -> dict[str, int]:
@@ -177,7 +184,8 @@ def pack_geometry(
         _add_sphere(pile, scene, ball, len(scene.meshes) + i, captured_sets)
     points = np.concatenate(pile.points) if pile.points else np.zeros((0, 3), np.float32)
     bvh = Bvh(points, pile.parts)
-    first, sphere, thing_of, sheet, first_normal = list(zip(*pile.rows, strict=True)) or [[], [], [], [], []]
+    columns: list[Any] = list(zip(*pile.rows, strict=True)) or [(), (), (), (), ()]
+    first, sphere, thing_of, sheet, first_normal = columns
     primvar_rows = np.array(pile.primvar_rows, np.int64).reshape(len(pile.rows), len(slots), 3)
     geometry = Geometry(
         handle=bvh.handle,
@@ -198,22 +206,25 @@ def pack_geometry(
     return geometry, bvh, slots
 
 
+def prim_of(path: str) -> str:
+    """The prim that a path belongs to: instances of a PointInstancer are drawn as `/Instancer/[7]/...`."""
+    return path.partition("/[")[0]
+
+
 def _mask(material: Material, static: bool, path: str, captured_sets: Sequence[frozenset[str] | None]) -> int:
     if material.refractive:
         return REFRACTIVE
-    if material.cutout:
-        mask = CUTOUT_STATIC if static else CUTOUT_MOVING
-    else:
-        mask = SOLID_STATIC if static else SOLID_MOVING
+    mask = (CUTOUT_STATIC if static else CUTOUT_MOVING) if material.cutout else SOLID_STATIC if static else SOLID_MOVING
     for k, paths in enumerate(captured_sets):
-        if paths is None or path in paths:
+        if paths is None or prim_of(path) in paths:
             mask |= 1 << (FIRST_CAPTURED_BIT + k)
     return mask
 
 
 def _add_mesh(pile: _Pile, scene: Scene, mesh: Mesh, thing: int, captured_sets: Sequence[Any]) -> None:
-    masks = [_mask(m, mesh.static, mesh.path, captured_sets) for m in scene.materials]
-    mask_of_triangle = np.array(masks, np.int64)[mesh.materials]
+    used, which = np.unique(mesh.materials, return_inverse=True)
+    masks = [_mask(scene.materials[m], mesh.static, mesh.path, captured_sets) for m in used]
+    mask_of_triangle = np.array(masks, np.int64)[which]
     base = pile.point_count
     pile.points.append(mesh.points)
     pile.point_count += len(mesh.points)

@@ -32,7 +32,7 @@ _SPENT = 1.0 - 1e-6
 
 
 class Query(NamedTuple):
-    """Sixteen rays that want a colour, and what they got."""
+    """Eight rays that want a colour, and what they got."""
 
     on: Any
     origin: Any
@@ -47,12 +47,12 @@ class Query(NamedTuple):
     """1: the ray starts inside a medium and is known to meet an opaque object there"""
     color: Any
     weight: Any
-    """shape (16, 5): screen, ray, probe, sky, none; sums to 1"""
+    """shape (8, 5): screen, ray, probe, sky, none; sums to 1"""
     confidence: Any
 
 
 def new_query() -> Query:
-    """Room for sixteen rays."""
+    """Room for eight rays."""
     z = np.zeros
     return Query(
         z(LANES, np.int32), z((LANES, 3)), z((LANES, 3)), z((LANES, 3)), z(LANES), z(LANES), z(LANES, np.int32),
@@ -82,7 +82,7 @@ def ask(query, order, hdrp, screen, probes, thing_probe, z_self, block, second, 
         order: tier codes, first asked first.
         hdrp: screen tier by proxy instead of by march, with HDRP's mapping of roughness.
         thing_probe: shape (things,), the probe whose proxy serves each thing, or -1.
-        z_self: shape (16,), z_depth of the shaded pixels.
+        z_self: shape (8,), z_depth of the shaded pixels.
         block: gives the pixels; `second`, `third` and the packet are overwritten.
     """
     inside = False

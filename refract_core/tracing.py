@@ -79,7 +79,7 @@ def _absent(world, packet, lane):  # type: ignore[no-untyped-def]
 
 @inlined
 def intersect_world(packet, world, far, coherent):  # type: ignore[no-untyped-def]
-    """Nearest present hit of every active lane. `far`: shape (16,), the T_FAR each lane started with."""
+    """Nearest present hit of every active lane. `far`: shape (8,), the T_FAR each lane started with."""
     handle = world.geometry.handle
     intersect(packet, handle, coherent)
     if not world.cutouts:
@@ -114,7 +114,7 @@ def add_shadow_ray(packet, lane, point, ng, direction, distance):  # type: ignor
 
 @inlined
 def visible(packet, world, mask, result):  # type: ignore[no-untyped-def]
-    """Whether each active lane reaches its T_FAR: 1 or 0 into `result` (16,), 1 for inactive lanes.
+    """Whether each active lane reaches its T_FAR: 1 or 0 into `result` (8,), 1 for inactive lanes.
 
     Glass does not cast shadows: light on its way to an opaque surface is not bent (no caustics).
     """

@@ -215,9 +215,15 @@ def test_without_a_camera_everything_is_in_the_picture(up: str) -> None:
 
 
 def test_it_stands_where_usdrecord_puts_its_own() -> None:
-    """Half the field of view spans the diagonal of the front face: for a 3 x 4 x 2 box and 50 mm over 20.955 mm that is
-    5 / tan(half) + 1 in front of the centre."""
-    camera = frame_everything(((-1.5, -2, -1), (1.5, 2, 1)))
+    """The field of view spans the diagonal of the front face (UsdAppUtilsFrameRecorder): for a 4 x 3 x 2 box and 50 mm
+    over 20.955 mm that is 2.5 / tan(half) + 1 in front of the centre."""
+    camera = frame_everything(((-2, -1.5, -1), (2, 1.5, 1)))
     half = math.atan(20.955 / 2 / 50)
-    assert camera.world_from_camera[:3, 3] == pytest.approx((0, 0, 5 / math.tan(half) + 1))
+    assert camera.world_from_camera[:3, 3] == pytest.approx((0, 0, 2.5 / math.tan(half) + 1))
     assert camera.world_from_camera[:3, :3] == pytest.approx(np.eye(3))
+
+
+def test_a_tall_stage_is_not_cut() -> None:
+    """A 0 x 4 front face just fills the height: 2 / tan of half the vertical field of view."""
+    camera = frame_everything(((0, -2, 0), (0, 2, 0)))
+    assert camera.world_from_camera[2, 3] == pytest.approx(2 * 50 / (15.2908 / 2))

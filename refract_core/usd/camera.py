@@ -199,16 +199,15 @@ def _asked_for(cameras: tuple[Camera, ...], wanted: str, notices: list[Notice]) 
 
 def frame_everything(bounds: tuple[tuple[float, float, float], tuple[float, float, float]]) -> Camera:
     """A 50 mm camera in front of the bounds, looking along -Z, as far away as usdrecord puts its own: the diagonal of
-    the bounds' front face spans half the picture's width.
+    the bounds' front face spans the picture's width. Bounds so tall that this would cut them are seen from farther.
 
     Args:
         bounds: min and max [m], engine world
     """
     low, high = np.array(bounds, np.float64)
-    size = high - low
-    half_width = APERTURE[0] / 2 / FOCAL_LENGTH
-    distance = float(math.hypot(size[0], size[1]) / half_width + size[2] / 2) or 1.0
+    width, height, depth = high - low
+    right, top = APERTURE[0] / 2 / FOCAL_LENGTH, APERTURE[1] / 2 / FOCAL_LENGTH
+    distance = float(max(math.hypot(width, height) / 2 / right, height / 2 / top) + depth / 2) or 1.0
     pose = np.eye(4)
     pose[:3, 3] = (low + high) / 2 + (0.0, 0.0, distance)
-    right, top = half_width, APERTURE[1] / 2 / FOCAL_LENGTH
     return Camera("", pose, (-right, right, -top, top), clipping=(distance * 1.0e-3, distance * 1.0e3))

@@ -48,7 +48,7 @@ class Part(NamedTuple):
 
 
 def bind(prims: Sequence[Usd.Prim], notices: list[Notice]) -> list[Bound]:
-    """The materials of many prims at once: those bound for `full`, else for all purposes."""
+    """The materials of many prims at once: those bound for `full`, else for all purposes, else for `preview`."""
     subsets = [
         UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets() if prim.GetTypeName() == "Mesh" else []
         for prim in prims
@@ -57,6 +57,13 @@ def bind(prims: Sequence[Usd.Prim], notices: list[Notice]) -> list[Bound]:
     if not asked:
         return []
     found, said = UsdShade.MaterialBindingAPI.ComputeBoundMaterials(asked, UsdShade.Tokens.full)
+    missing = [place for place, material in enumerate(found) if not material]
+    if missing:
+        previews, _ = UsdShade.MaterialBindingAPI.ComputeBoundMaterials(
+            [asked[place] for place in missing], UsdShade.Tokens.preview
+        )
+        for place, preview in zip(missing, previews, strict=True):
+            found[place] = preview
     materials = []
     for prim, material, relationship in zip(asked, found, said, strict=True):
         materials.append(material if material else None)

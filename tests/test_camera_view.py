@@ -1,0 +1,121 @@
+"""Pixels to rays and back, for windows of every kind."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scenes import camera, view_rays
+
+from refract_core.camera import View, image_size, pixel_point, pixel_ray, project, view_of
+from refract_core.errors import UsageError
+from refract_core.kernel import kernel
+from refract_core.pointer import Pointer
+from refract_core.sampling import pixel_offset
+from refract_core.scene import Camera
+
+F64 = NDArray[np.float64]
+
+PERSPECTIVE = replace(camera((1, 2, 3), (-2, 0.5, -1)), window=(-0.3, 0.7, -0.2, 0.4))
+ORTHOGRAPHIC = replace(PERSPECTIVE, orthographic=True)
+CAMERAS = pytest.mark.parametrize("of", [PERSPECTIVE, ORTHOGRAPHIC], ids=["perspective", "orthographic"])
+
+
+@kernel
+def _rays(view, pixels, out):  # type: ignore[no-untyped-def]
+    for i in range(pixels.shape[0]):
+        o, d, cosine = pixel_ray(view, pixels[i, 0], pixels[i, 1])
+        out[i, 0], out[i, 1], out[i, 2] = o[0], o[1], o[2]
+        out[i, 3], out[i, 4], out[i, 5], out[i, 6] = d[0], d[1], d[2], cosine
+
+
+@kernel
+def _around(view, pixels, out):  # type: ignore[no-untyped-def]
+    for i in range(pixels.shape[0]):
+        p = pixel_point(view, pixels[i, 0], pixels[i, 1], pixels[i, 2])
+        out[i, 0], out[i, 1], out[i, 2] = project(view, p)
+
+
+def rays(view: View, pixels: F64) -> tuple[F64, F64, F64]:
+    out = np.empty((len(pixels), 7))
+    _rays(Pointer(view), pixels, out)
+    return out[:, :3], out[:, 3:6], out[:, 6]
+
+
+def grid(width: int, height: int) -> F64:
+    y, x = np.mgrid[:height, :width] + 0.5
+    return np.stack([x.ravel(), y.ravel()], 1)
+
+
+@CAMERAS
+def test_a_pixel_projects_to_itself(of: Camera) -> None:
+    rng = np.random.default_rng(1)
+    pixels = np.stack([rng.uniform(0, 120, 200), rng.uniform(0, 50, 200), rng.uniform(0.1, 30, 200)], 1)
+    out = np.empty_like(pixels)
+    _around(Pointer(view_of(of, 120, 50)), pixels, out)
+    np.testing.assert_allclose(out, pixels, rtol=1e-9, atol=1e-9)
+
+
+@CAMERAS
+def test_rays_are_those_of_a_pinhole_written_out_by_hand(of: Camera) -> None:
+    """The window has the aspect 10 : 6 of the image, so nothing is conformed. Axes from the camera's own matrix."""
+    origins, directions, cosine = rays(view_of(of, 50, 30), grid(50, 30))
+    o, d = view_rays(of, 50, 30)
+    np.testing.assert_allclose(origins, o.reshape(-1, 3), atol=1e-12)
+    np.testing.assert_allclose(directions, d.reshape(-1, 3), atol=1e-12)
+    np.testing.assert_allclose(cosine, -d.reshape(-1, 3) @ of.world_from_camera[:3, 2], atol=1e-12)
+
+
+def test_the_first_row_is_the_top_and_the_first_column_the_left() -> None:
+    _, d, _ = rays(view_of(camera((0, 0, 5)), 4, 4), np.array([[0.5, 0.5], [3.5, 3.5]]))
+    assert d[0, 0] < 0 < d[0, 1]
+    assert d[1, 1] < 0 < d[1, 0]
+
+
+@pytest.mark.parametrize(("width", "height"), [(200, 40), (40, 200), (100, 60)])
+@CAMERAS
+def test_conforming_only_ever_shows_more_and_keeps_pixels_square(of: Camera, width: int, height: int) -> None:
+    left, right, bottom, top = of.window
+    window = view_of(of, width, height).window
+    assert window[0] <= left + 1e-12
+    assert window[1] >= right - 1e-12
+    assert window[2] <= bottom + 1e-12
+    assert window[3] >= top - 1e-12
+    assert (window[1] - window[0]) / width == pytest.approx((window[3] - window[2]) / height, rel=1e-12)
+    # One direction is filled exactly, and the centre stays.
+    assert min((window[1] - window[0]) / (right - left), (window[3] - window[2]) / (top - bottom)) == pytest.approx(1)
+    assert window[:2].mean() == pytest.approx((left + right) / 2)
+    assert window[2:].mean() == pytest.approx((bottom + top) / 2)
+
+
+def test_height_follows_the_aspect() -> None:
+    assert image_size(PERSPECTIVE, 100, 0) == (100, 60)
+    assert image_size(PERSPECTIVE, 100, 7) == (100, 7)
+
+
+def test_sample_zero_stands_at_the_centre_and_the_rest_fill_the_pixel() -> None:
+    assert pixel_offset(0) == (0.0, 0.0)
+    offsets = np.array([pixel_offset(i) for i in range(64)])
+    assert (offsets >= -0.5).all()
+    assert (offsets < 0.5).all()
+    assert np.abs(offsets.mean(0)).max() < 0.05
+    # Each quarter of the pixel gets its share of 64 samples, 16, give or take 2 (low discrepancy).
+    quarter = 2 * (offsets[:, 0] < 0) + (offsets[:, 1] < 0)
+    assert np.abs(np.bincount(quarter, minlength=4) - 16).max() <= 2
+
+
+@CAMERAS
+def test_jitter_moves_rays_by_that_many_pixels(of: Camera) -> None:
+    pixels = grid(5, 3)
+    moved = rays(view_of(of, 5, 3, (0.25, -0.4)), pixels)
+    expected = rays(view_of(of, 5, 3), pixels + np.array([0.25, -0.4]))
+    for a, b in zip(moved, expected, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+@pytest.mark.parametrize("window", [(0.0, 0.0, -1.0, 1.0), (-1.0, 1.0, 1.0, -1.0), (-1.0, float("nan"), -1.0, 1.0)])
+def test_an_empty_window_is_refused(window: tuple[float, float, float, float]) -> None:
+    with pytest.raises(UsageError, match="/camera"):
+        view_of(replace(PERSPECTIVE, window=window), 4, 4)

@@ -1,0 +1,148 @@
+"""Walks through real meshes, seen in the colours of the position room, against a slow tracer written apart."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scenes import (
+    box,
+    camera,
+    draw,
+    glass,
+    material,
+    position_room,
+    scene,
+    shell,
+    trace_mesh,
+    turned,
+    view_rays,
+    wall_hit,
+    where,
+)
+
+from refract_core.optics import fresnel_dielectric, sphere_model
+from refract_core.scene import Camera, Mesh, Model, Sphere
+
+F64 = NDArray[np.float64]
+SIZE = 24
+
+
+def picture_of(things: list[Mesh | Sphere], ior: float, lens: Camera, **inputs: Any) -> dict[str, NDArray[np.float32]]:
+    walls, materials = position_room()
+    meshes = [t for t in things if isinstance(t, Mesh)]
+    balls = [t for t in things if isinstance(t, Sphere)]
+    extra = [glass(Model.TRACED, ior, **inputs), material("/ember", EMISSIVE=0.25)]
+    return draw(scene([*walls, *meshes], [*materials, *extra], balls, cameras=(lens,)), SIZE, SIZE)
+
+
+def places(picture: dict[str, NDArray[np.float32]], d: F64, ior: float) -> F64:
+    """What the transmitted light saw; the share 1 - F of it is exact."""
+    cos_i = np.clip(-(d * picture["N"]).sum(-1), 0, 1)
+    share = 1 - fresnel_dielectric(cos_i, 1 / ior)
+    return where(picture["refraction"] / np.maximum(share, 1e-9)[..., None])
+
+
+SOLIDS = {
+    "slab": box("/slab", (1.5, 1.5, 0.25), 1),
+    "cube": box("/cube", (0.5, 0.5, 0.5), 1, turned((1, 2, 3), 40)),
+    "brick": box("/brick", (0.7, 0.3, 0.5), 1, turned((2, -1, 1), 25), (0.2, 0.1, 0.0)),
+    "hollow shell": shell("/shell", 0.8, 0.5, 1),
+}
+
+
+@pytest.mark.parametrize("ior", [1.0, 1.33, 1.5, 2.0])
+@pytest.mark.parametrize("name", list(SOLIDS))
+def test_the_walk_is_the_slow_tracers_walk(name: str, ior: float) -> None:
+    """Same wall, same path length, through any number of faces, total reflections and hollows.
+
+    Rays near an edge may take another face by the last bit; one in fifty may differ, no more.
+    """
+    lens = camera((0.3, 0.9, 2.3), (0, 0, 0))
+    mesh = SOLIDS[name]
+    picture = picture_of([mesh], ior, lens)
+    origin, d = view_rays(lens, SIZE, SIZE)
+    seen = places(picture, d, ior)
+    rows, reflections = [], 0
+    for y, x in np.argwhere(picture["mask"] > 0):
+        p, out, path, bounced = trace_mesh(mesh, ior, origin[y, x], d[y, x])
+        if bounced > 12:  # trapped: the engine gives up after 24 interfaces
+            continue
+        reflections += bounced
+        rows.append((np.abs(wall_hit(p, out) - seen[y, x]).max(), abs(path - picture["path_length"][y, x])))
+    assert len(rows) > 40
+    errors = np.array(rows)
+    assert (errors[:, 0] < 2e-3).mean() > 0.98
+    assert (errors[:, 1] < 1e-3).mean() > 0.98
+    if name in ("cube", "brick") and ior >= 1.5:
+        assert reflections > 10  # total reflection is what these are here for
+
+
+def test_a_glass_ball_walks_as_the_sphere_model_says() -> None:
+    """Exact sphere, thickness = diameter: exit point, direction and length (HDRP's model is exact there)."""
+    lens = camera((0.3, 0.9, 2.3), (0, 0, 0), fov=0.3)
+    ball = Sphere("/ball", (0.1, 0.0, 0.1), 0.7, 1)
+    picture = picture_of([ball], 1.5, lens)
+    origin, d = view_rays(lens, SIZE, SIZE)
+    c = np.array(ball.centre) - origin
+    along = (c * d).sum(-1)
+    inside = 0.49 - ((c * c).sum(-1) - along**2)
+    here = inside > 0.49 * 0.05
+    entry = (origin + d * (along - np.sqrt(np.maximum(inside, 0)))[..., None])[here]
+    n = (entry - np.array(ball.centre)) / 0.7
+    model = sphere_model(entry, n, -d[here], 1.5, 1.4)
+    np.testing.assert_allclose(places(picture, d, 1.5)[here], wall_hit(model.point, model.direction), atol=1e-3)
+    np.testing.assert_allclose(picture["path_length"][here], model.path_length, rtol=1e-4)
+
+
+def test_an_opaque_thing_inside_is_seen() -> None:
+    """An ember of radiance 0.25 in a glass cube: where the refracted ray meets it, its colour, and the way to it."""
+    lens = camera((0, 0, 2.5), (0, 0, 0), fov=0.01)
+    cube, ember = box("/cube", (0.5, 0.5, 0.5), 1), Sphere("/ember", (0, 0, 0), 0.2, 2)
+    picture = picture_of([cube, ember], 1.5, lens)
+    middle = np.s_[SIZE // 2 - 2 : SIZE // 2 + 2, SIZE // 2 - 2 : SIZE // 2 + 2]
+    # Head-on: F = 0.04, and 0.5 - 0.2 of glass before the ember.
+    np.testing.assert_allclose(picture["refraction"][middle], 0.96 * 0.25, rtol=1e-3)
+    np.testing.assert_allclose(picture["path_length"][middle], 0.3, atol=2e-3)
+    assert (picture["weight.ray"][middle] == 1).all()
+
+
+def test_other_glass_on_the_way_bends_and_absorbs() -> None:
+    """Two slabs one behind the other shift twice and absorb twice."""
+    lens = camera((0.9, 0.6, 2.3), (0, 0, 0), fov=0.2)
+    one = box("/one", (1.8, 1.8, 0.1), 1, centre=(0, 0, 0.4))
+    two = box("/two", (1.8, 1.8, 0.1), 1, centre=(0, 0, -0.4))
+    picture = picture_of([one, two], 1.5, lens, TRANSMITTANCE=(0.5, 0.5, 0.5), absorption_distance=0.4)
+    origin, d = view_rays(lens, SIZE, SIZE)
+    cos_t = np.sqrt(1 - (1 - d[..., 2] ** 2) / 2.25)
+    flat = d[..., :2] / np.linalg.norm(d[..., :2], axis=-1, keepdims=True)
+    inside, outside = np.sqrt(1 - cos_t**2) / cos_t, np.sqrt(1 - d[..., 2] ** 2) / -d[..., 2]
+    np.testing.assert_allclose(picture["path_length"], 0.4 / cos_t, rtol=1e-4)
+    np.testing.assert_allclose(picture["transmittance"][..., 0], 0.5 ** (1 / cos_t), rtol=1e-4)
+    entry = origin + d * ((0.5 - origin[..., 2:]) / d[..., 2:])
+    leave = entry - [0, 0, 1.0]
+    leave[..., :2] += flat * (0.4 * inside + 0.6 * outside)[..., None]
+    share = (1 - fresnel_dielectric(-d[..., 2], 1 / 1.5))[..., None] * picture["transmittance"]
+    np.testing.assert_allclose(where(picture["refraction"] / share), wall_hit(leave, d), atol=2e-3)
+
+
+def test_an_eye_inside_the_glass_sees_out() -> None:
+    """The picture is finite and the room is there; no ray may be lost between the eye and the first face."""
+    lens = camera((0, 0, 0.1), (0, 0, -1), fov=0.2)
+    picture = picture_of([box("/cube", (1, 1, 1), 1)], 1.0, lens)
+    origin, d = view_rays(lens, SIZE, SIZE)
+    assert np.isfinite(picture["beauty"]).all()
+    np.testing.assert_allclose(where(picture["beauty"]), wall_hit(origin, d), atol=1e-3)
+
+
+def test_the_wrong_winding_is_still_a_walk_that_ends() -> None:
+    """A cube turned inside out has no outside to enter; the picture stays finite and the weights whole."""
+    cube = SOLIDS["cube"]
+    picture = picture_of([replace(cube, triangles=cube.triangles[:, ::-1].copy())], 1.5, camera())
+    assert np.isfinite(picture["beauty"]).all()
+    total = np.sum([picture[f"weight.{k}"] for k in ("screen", "ray", "probe", "sky", "none")], axis=0)
+    here = picture["mask"] > 0
+    np.testing.assert_allclose(total[here], 1.0, atol=1e-5)

@@ -1,0 +1,274 @@
+"""Laws of optics that every picture of glass obeys, measured in small rooms."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scenes import (
+    ROOM,
+    box,
+    camera,
+    checker_room,
+    constant_room,
+    dome,
+    draw,
+    glass,
+    material,
+    position_room,
+    quad,
+    scene,
+    turned,
+    view_rays,
+    wall_hit,
+    where,
+)
+
+from refract_core.optics import fresnel_dielectric
+from refract_core.scene import Material, Mesh, Model, Probe, Scene, Sphere, Volume
+
+F32 = NDArray[np.float32]
+
+MODELS = [Model.SPHERE, Model.BOX, Model.THIN, Model.TRACED]
+BALL = Sphere("/ball", (0.1, -0.1, 0.2), 0.8, 1)
+CUBE = box("/cube", (0.6, 0.5, 0.4), 1, turned((1, 2, 3), 40))
+
+
+def in_positions(what: Material, *things: Mesh | Sphere, **fields: Any) -> Scene:
+    walls, materials = position_room()
+    meshes = [t for t in things if isinstance(t, Mesh)]
+    return scene([*walls, *meshes], [*materials, what], [t for t in things if isinstance(t, Sphere)], **fields)
+
+
+# --- Nothing there --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("thing", [BALL, CUBE], ids=["ball", "cube"])
+def test_glass_of_ior_one_is_not_there(model: Model, thing: Mesh | Sphere) -> None:
+    """Snell and Fresnel at n = 1: no bending, no reflection. By rays, to the rounding of float32 positions.
+
+    HDRP's box is as long as 1 / cos t: at grazing pixels its exit lies behind the walls, where there is nothing to see.
+    """
+    picture = draw(in_positions(glass(model, 1.0), thing))
+    empty = draw(in_positions(glass(model, 1.0)))
+    within = picture["path_length"] < 1.6  # from the object no wall is nearer
+    assert (within & (picture["mask"] > 0)).mean() > 0.1
+    assert model is Model.BOX or within.all()
+    np.testing.assert_allclose(picture["beauty"][within], empty["beauty"][within], atol=2e-5)
+
+
+def test_glass_of_ior_one_is_not_there_for_the_screen() -> None:
+    """By march, where the screen answers whole. The walls' colour is linear in place, so bilinear reads are exact."""
+    picture = draw(in_positions(glass(Model.TRACED, 1.0), BALL), tiers=("screen", "ray"))
+    empty = draw(in_positions(glass(Model.TRACED, 1.0)))
+    here = (picture["mask"] > 0) & (picture["weight.screen"] > 0.999)
+    assert here.mean() > 0.1
+    # Half a pixel at the far wall, 5.5 m off: 5.5 / 64 / 2 m, in colours 1 / 6 of that. Edges of walls need it.
+    error = np.abs(picture["beauty"] - empty["beauty"]).max(-1)
+    assert error.max() < 0.5 * 5.5 / 64 / 6
+    assert np.median(error[here]) < 1e-4
+
+
+def test_glass_of_ior_one_is_not_there_for_a_probe() -> None:
+    """A probe whose proxy is the room finds the very point of the wall; texels blur what is not linear on a face."""
+    room = Volume(np.eye(4), False, (ROOM,) * 3)
+    probe = Probe("/probe", "baked", (0.0, 0.0, 0.0), room, room, resolution=64, clipping=(0.01, 100.0))
+    picture = draw(in_positions(glass(Model.TRACED, 1.0), BALL, probes=(probe,)), tiers=("probe",))
+    empty = draw(in_positions(glass(Model.TRACED, 1.0)))
+    here = picture["mask"] > 0
+    np.testing.assert_allclose(picture["weight.probe"][here], 1.0, atol=1e-5)
+    # Captured from the middle of a cube every face shows one wall, on which place is linear: only the half texel
+    # where faces meet differs, by less than a texel: 6 m / 64, in colours 1 / 64.
+    error = np.abs(picture["beauty"] - empty["beauty"]).max(-1)
+    assert error.max() < 1 / 64
+    assert np.median(error[here]) < 1e-4
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"tiers": ("ray",)},
+        {"tiers": ("screen", "ray")},
+        {"tiers": ("screen", "ray"), "screen": "proxy"},
+        {"tiers": ("screen", "probe", "sky")},
+        {"tiers": ("probe",)},
+        {"tiers": ("probe", "screen", "ray")},
+    ],
+    ids=lambda s: "-".join(s["tiers"]) + s.get("screen", ""),
+)
+def test_white_furnace(model: Model, settings: dict[str, Any]) -> None:
+    """Clear glass in a room of one radiance is invisible: what Fresnel takes from one direction comes from another."""
+    walls, materials = constant_room(0.75)
+    what = scene([*walls, CUBE], [*materials, glass(model)], [replace(BALL, centre=(0.5, 0.4, -0.8))])
+    picture = draw(what, **settings)
+    assert picture["mask"].mean() > 0.1
+    np.testing.assert_allclose(picture["beauty"][..., :3], 0.75, atol=1e-4)
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("tiers", [("sky",), ("ray", "sky"), ("screen", "probe", "sky"), ("probe", "sky")])
+def test_white_furnace_under_a_dome(model: Model, tiers: tuple[str, ...]) -> None:
+    picture = draw(scene([CUBE], [material("/none"), glass(model)], environment=dome(0.75)), tiers=tiers)
+    assert picture["mask"].mean() > 0.1
+    np.testing.assert_allclose(picture["beauty"][..., :3], 0.75, atol=1e-4)
+
+
+# --- Absorption -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("model", [Model.SPHERE, Model.BOX])
+def test_twice_the_thickness_squares_transmittance(model: Model) -> None:
+    colour = (0.9, 0.6, 0.3)
+    one, two = (
+        draw(in_positions(glass(model, THICKNESS=t, TRANSMITTANCE=colour), BALL))["transmittance"] for t in (0.4, 0.8)
+    )
+    assert one[32, 32, 2] < 0.8
+    np.testing.assert_allclose(two, one**2, atol=1e-5)
+
+
+@pytest.mark.parametrize("width", [0.2, 0.4, 0.8])
+def test_a_traced_slab_absorbs_by_its_real_thickness(width: float) -> None:
+    """Straight through a slab: colour ^ (width / absorption distance), Beer and Lambert."""
+    what = glass(Model.TRACED, TRANSMITTANCE=(0.9, 0.6, 0.3), absorption_distance=0.5)
+    lens = camera((0, 0, 2.5), fov=0.5, orthographic=True)
+    picture = draw(in_positions(what, box("/slab", (1, 1, width / 2), 1), cameras=(lens,)), 8, 8)
+    np.testing.assert_allclose(picture["path_length"], width, rtol=1e-4)
+    expected = np.array([0.9, 0.6, 0.3]) ** (width / 0.5)
+    np.testing.assert_allclose(picture["transmittance"], np.broadcast_to(expected, (8, 8, 3)), rtol=1e-4)
+
+
+def test_a_thin_pane_tints_by_the_length_of_the_way_through_it() -> None:
+    """Colour ^ (1 / cos t), with sin t = sin i / n: thickness and absorption distance of thin are the same 5 mm."""
+    pane = quad("/pane", [(-2, -2, 0), (2, -2, 0), (2, 2, 0), (-2, 2, 0)], 1)
+    lens = camera((1.5, 0.5, 1.5), (0, 0, 0))
+    picture = draw(in_positions(glass(Model.THIN, TRANSMITTANCE=(0.8, 0.5, 0.2)), pane, cameras=(lens,)))
+    _, d = view_rays(lens, 64, 64)
+    cos_t = np.sqrt(1 - (1 - d[..., 2] ** 2) / 1.5**2)[..., None]
+    here = picture["mask"] > 0
+    assert here.mean() > 0.8
+    expected = np.array([0.8, 0.5, 0.2]) ** (1 / cos_t)
+    np.testing.assert_allclose(picture["transmittance"][here], expected[here], rtol=1e-4)
+
+
+# --- Bending --------------------------------------------------------------------------------------------------------
+
+
+def seen_through(picture: dict[str, F32], ior: float, cos_i: NDArray[Any]) -> NDArray[np.float64]:
+    """Place on the walls that the transmitted light came from: its share 1 - F is known exactly."""
+    share = 1 - fresnel_dielectric(np.clip(cos_i, 0, 1), 1 / ior)
+    return where(picture["refraction"] / np.maximum(share, 1e-9)[..., None])
+
+
+@pytest.mark.parametrize("model", [Model.BOX, Model.TRACED])
+def test_a_slab_shifts_and_does_not_turn(model: Model) -> None:
+    """Exit parallel to entry, displaced along the face by t (tan i - tan t) (Hecht, Optics, 4.4)."""
+    width, ior = 0.5, 1.5
+    lens = camera((1.2, 0.4, 2.2), (0, 0, 0), fov=0.2)
+    what = in_positions(glass(model, ior, THICKNESS=width), box("/slab", (2, 2, width / 2), 1), cameras=(lens,))
+    picture = draw(what, 48, 48)
+    assert (picture["mask"] > 0).all()
+    origin, d = view_rays(lens, 48, 48)
+    cos_i = -d[..., 2]
+    flat = d * [1, 1, 0] / np.linalg.norm(d[..., :2], axis=-1, keepdims=True)
+    sin_i = np.sqrt(1 - cos_i**2)
+    tan_t = sin_i / ior / np.sqrt(1 - (sin_i / ior) ** 2)
+    entry = origin + d * ((width / 2 - origin[..., 2:]) / d[..., 2:])
+    leave = entry + flat * (width * tan_t)[..., None] - [0, 0, width]
+    np.testing.assert_allclose(seen_through(picture, ior, cos_i), wall_hit(leave, d), atol=2e-4)
+    shift = width * (sin_i / cos_i - tan_t)
+    straight = wall_hit(origin, d)
+    assert np.abs(straight - wall_hit(leave, d)).max() > 0.1  # the shift is there to be seen
+    assert shift.min() > 0.05
+
+
+def test_the_sphere_model_is_the_traced_exit_of_a_sphere() -> None:
+    """Thickness = diameter, by rays, in a checkered room: within 1/255 where the ray does not graze (cos i > 0.3)."""
+    walls, materials, textures = checker_room()
+    pictures = []
+    for model in (Model.SPHERE, Model.TRACED):
+        ball = replace(BALL, material=6)
+        what = scene(walls, [*materials, glass(model, THICKNESS=1.6)], [ball], textures=textures)
+        pictures.append(draw(what, 96, 96))
+    a, b = pictures
+    _, d = view_rays(camera(), 96, 96)
+    here = (a["mask"] > 0) & ((-d * a["N"]).sum(-1) > 0.3)
+    assert here.mean() > 0.2
+    assert np.abs(a["beauty"] - b["beauty"])[here].max() < 1 / 255
+    np.testing.assert_allclose(a["path_length"][here], b["path_length"][here], atol=1e-4)
+
+
+@pytest.mark.parametrize("settings", [{"tiers": ("screen", "ray")}, {"tiers": ("screen", "probe"), "screen": "proxy"}])
+def test_a_marble_shows_the_room_upside_down(settings: dict[str, Any]) -> None:
+    """Behind its focus (n r / (2 (n - 1)) = 1.2 m from the centre) a ball shows the far wall turned by 180 degrees:
+    the place seen moves left while the pixel moves right, and down while it moves up."""
+    ball = Sphere("/ball", (0.0, 0.0, 0.5), 0.8, 1)
+    picture = draw(in_positions(glass(Model.SPHERE, THICKNESS=1.6), ball), 96, 96, **settings)
+    middle = np.s_[40:56, 40:56]
+    assert picture["weight.screen"][middle].min() > 0.9
+    place = where(picture["beauty"][middle])
+    assert (np.diff(place[..., 0], axis=1) < 0).mean() > 0.95
+    assert (np.diff(place[..., 1], axis=0) > 0).mean() > 0.95
+    straight = where(draw(in_positions(glass(Model.SPHERE)), 96, 96)["beauty"][middle])
+    assert (np.diff(straight[..., 0], axis=1) > 0).all()
+    assert (np.diff(straight[..., 1], axis=0) < 0).all()
+
+
+def test_a_mirror_angle_reflects_the_share_that_fresnel_says() -> None:
+    """A black-backed view: reflection = F(cos i) times the radiance of the room, which is 1."""
+    walls, materials = constant_room()
+    lens = camera((2.0, 0.3, 1.0), (0, 0, 0))
+    pane = quad("/pane", [(-2, -2, 0), (2, -2, 0), (2, 2, 0), (-2, 2, 0)], 1)
+    picture = draw(scene([*walls, pane], [*materials, glass(Model.THIN, 1.8)], cameras=(lens,)))
+    _, d = view_rays(lens, 64, 64)
+    here = picture["mask"] > 0
+    cos_i = np.abs(d[..., 2])[here]
+    cos_t = np.sqrt(1 - (1 - cos_i**2) / 1.8**2)
+    rs = (cos_i - 1.8 * cos_t) / (cos_i + 1.8 * cos_t)
+    rp = (1.8 * cos_i - cos_t) / (1.8 * cos_i + cos_t)
+    np.testing.assert_allclose(picture["reflection"][here][:, 0], (rs**2 + rp**2) / 2, atol=1e-4)
+
+
+# --- Layers ---------------------------------------------------------------------------------------------------------
+
+
+def test_glass_behind_glass_needs_a_second_layer() -> None:
+    """A clear pane before a green block: with one layer the block is missing, with two its colour is there."""
+    walls, materials = constant_room()
+    pane = quad("/pane", [(-1, -1, 1), (1, -1, 1), (1, 1, 1), (-1, 1, 1)], 1)
+    block = box("/block", (0.5, 0.5, 0.25), 2)
+    green = glass(Model.BOX, 1.0, THICKNESS=0.5, TRANSMITTANCE=(0.25, 1.0, 0.25), absorption_distance=0.5)
+    what = scene([*walls, pane, block], [*materials, glass(Model.THIN, 1.0), green])
+    one, two = (draw(what, tiers=("screen", "ray"), max_layers=n) for n in (1, 2))
+    np.testing.assert_allclose(one["beauty"][32, 32, :3], 1.0, atol=1e-4)
+    # The block's middle is crossed straight: 0.5 m at an absorption distance of 0.5 m. n = 1 reflects nothing.
+    np.testing.assert_allclose(two["beauty"][32, 32, :3], [0.25, 1.0, 0.25], atol=2e-3)
+    assert (one["layers"].max(), two["layers"].max()) == (1, 2)
+
+
+@pytest.mark.parametrize("opacity", [0.0, 0.3, 1.0])
+def test_opacity_is_how_much_of_the_surface_colour_is_left(opacity: float) -> None:
+    """Emissive glass of ior 1 in a room of radiance 1: opacity times its own light, the rest the room's."""
+    walls, materials = constant_room()
+    what = scene([*walls, CUBE], [*materials, glass(Model.TRACED, 1.0, OPACITY=opacity, EMISSIVE=3.0)])
+    picture = draw(what)
+    here = picture["mask"] > 0
+    np.testing.assert_allclose(picture["beauty"][here][:, 0], 3 * opacity + (1 - opacity), atol=1e-4)
+
+
+def test_dispersion_spreads_red_and_blue_around_green() -> None:
+    """n_F > n_d > n_C: through a prism blue is turned most, red least, and green as without dispersion."""
+    tilted = box("/wedge", (0.6, 0.6, 0.6), 1, turned((0, 1, 0), 20))
+    angle = math.radians(70)
+    points = tilted.points.copy()
+    points[:, 2] = np.where(points[:, 2] < 0, points[:, 2] + math.cos(angle) * points[:, 0], points[:, 2])
+    wedge = replace(tilted, points=points)
+    plain = draw(in_positions(glass(Model.TRACED), wedge))["refraction"]
+    spread = draw(in_positions(glass(Model.TRACED, abbe=20.0), wedge))["refraction"]
+    np.testing.assert_allclose(spread[..., 1], plain[..., 1], atol=1e-5)
+    assert np.abs(spread[..., 0] - plain[..., 0]).max() > 1e-3

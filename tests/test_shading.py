@@ -1,0 +1,191 @@
+"""Light that leaves opaque surfaces, and surfaces with holes in them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scenes import (
+    box,
+    camera,
+    constant_room,
+    dome,
+    draw,
+    glass,
+    light,
+    material,
+    position_room,
+    quad,
+    scene,
+    turned,
+    view_rays,
+    wall_hit,
+    where,
+)
+
+from refract_core.scene import Channel, LightKind, Material, Model, Source, Sphere, Texture, Wrap
+
+CARD = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]
+
+
+def test_a_metal_mirror_shows_the_place_that_geometry_says() -> None:
+    """White polished metal in the position room: the wall met along d - 2 (d.n) n, times a reflectance near 1."""
+    walls, materials = position_room()
+    chrome = material("/chrome", DIFFUSE=1.0, METALLIC=1.0, ROUGHNESS=0.0)
+    lens = camera((1.0, 0.5, 2.0), (0, 0, 0))
+    planes = draw(scene([*walls, quad("/mirror", CARD, 1)], [*materials, chrome], cameras=(lens,)))
+    origin, d = view_rays(lens, 64, 64)
+    p = origin - d * (origin[..., 2:] / d[..., 2:])
+    here = (np.abs(p) < 0.99).all(-1)
+    expected = wall_hit(p, d * [1, 1, -1])[here]
+    # The split-sum fit of a white metal at roughness 0 is 1 within 2 %; black and white places bound the colour.
+    colour = planes["beauty"][here][:, :3]
+    np.testing.assert_allclose(where(colour), expected, atol=0.02 * 6)
+
+
+def ggx_albedo(cosine: float, alpha: float, steps: int = 300) -> float:
+    """Share of light that single-scattering GGX sends back: mean of G2 / G1 over visible normals (Heitz 2018)."""
+    u, v = np.meshgrid((np.arange(steps) + 0.5) / steps, (np.arange(steps) + 0.5) / steps)
+    wo = np.array([np.sqrt(1 - cosine**2), 0, cosine])
+    top = wo * [alpha, alpha, 1]
+    top /= np.linalg.norm(top)
+    x = np.array([0.0, 1.0, 0.0])
+    y = np.cross(top, x)
+    a, b = np.sqrt(u) * np.cos(2 * np.pi * v), np.sqrt(u) * np.sin(2 * np.pi * v)
+    s = (1 + top[2]) / 2
+    b = (1 - s) * np.sqrt(1 - a * a) + s * b
+    h = a[..., None] * x + b[..., None] * y + np.sqrt(np.maximum(0, 1 - a * a - b * b))[..., None] * top
+    h *= [alpha, alpha, 1]
+    h /= np.linalg.norm(h, axis=-1, keepdims=True)
+    leaving = (2 * (h @ wo)[..., None] * h - wo)[..., 2]
+
+    def masked(c: Any) -> Any:
+        return (np.sqrt(1 + alpha**2 * (1 / c**2 - 1)) - 1) / 2
+
+    g = (1 + masked(cosine)) / (1 + masked(cosine) + masked(np.maximum(leaving, 1e-6)))
+    return float(np.where(leaving > 0, g, 0).mean())
+
+
+@pytest.mark.parametrize("roughness", [0.0, 0.1, 0.3, 0.45, 0.7, 1.0])
+def test_white_metal_shows_a_room_of_one_radiance(roughness: float) -> None:
+    """A perfect reflector shows an isotropic field, less at most what single-scattering GGX loses (0.91 is left at
+    roughness 0.5, 0.31 at 1). More is better, since real light scatters on; more than there is, is not."""
+    walls, materials = constant_room(0.5)
+    chrome = material("/chrome", DIFFUSE=1.0, METALLIC=1.0, ROUGHNESS=roughness)
+    ball = Sphere("/ball", (0, 0, 0), 0.8, 1)
+    planes = draw(scene(walls if roughness < 0.5 else [], [*materials, chrome], [ball], environment=dome(0.5)))
+    seen = planes["beauty"][24:40, 24:40, 0] / 0.5
+    assert seen.max() < 1.02
+    assert seen.min() > ggx_albedo(1.0, max(roughness, 0.01) ** 2) - 0.03
+
+
+@pytest.mark.parametrize("albedo", [1.0, 0.5, 0.1])
+def test_a_matt_ball_under_a_constant_dome_is_its_albedo(albedo: float) -> None:
+    """Furnace: irradiance pi L on a convex body, so radiance albedo L. A surface of ior 1 has no Fresnel share; what
+    is left of the gloss is the error of Karis' fit at F0 = 0, under 0.3 %."""
+    ball = Sphere("/ball", (0, 0, 0), 0.8, 0)
+    planes = draw(scene([], [material("/m", DIFFUSE=albedo)], [ball], environment=dome(2.0)))
+    surface = np.isfinite(planes["Z"])
+    assert surface.mean() > 0.2
+    np.testing.assert_allclose(planes["beauty"][surface][:, 0], 2.0 * albedo, atol=2.0 * 0.006)
+
+
+def test_a_white_plastic_ball_neither_gains_nor_loses_much() -> None:
+    """Diffuse under a dielectric coat: the two shares may not sum to more than the light there is."""
+    ball = Sphere("/ball", (0, 0, 0), 0.8, 0)
+    plastic = material("/m", DIFFUSE=1.0, IOR=1.5, ROUGHNESS=0.6)
+    planes = draw(scene([], [plastic], [ball], environment=dome(1.0)))
+    seen = planes["beauty"][np.isfinite(planes["Z"])][:, 0]
+    assert seen.max() < 1.03
+    assert np.median(seen) > 0.95
+
+
+def test_emission_is_seen_as_it_is_from_every_side() -> None:
+    cube = box("/cube", (0.5, 0.5, 0.5), 0, turned((1, 2, 3), 50))
+    planes = draw(scene([cube], [material("/m", EMISSIVE=(0.1, 5.0, 0.7))]))
+    surface = np.isfinite(planes["Z"])
+    np.testing.assert_allclose(planes["beauty"][surface][:, :3], np.broadcast_to([0.1, 5.0, 0.7], (surface.sum(), 3)))
+
+
+def test_a_mirror_turned_away_from_the_light_has_no_highlight() -> None:
+    """The highlight of a small light stands where the mirror direction meets it, and is the light's radiance there."""
+    chrome = material("/chrome", DIFFUSE=1.0, METALLIC=1.0, ROUGHNESS=0.0)
+    lamp = light(LightKind.SPHERE, (0.5, 0.5, 2.5), (0, 0, -1), (0.2, 0), 4.0)
+    planes = draw(scene([quad("/mirror", np.array(CARD) * 3)], [chrome], lights=(lamp,)), 64, 64)
+    _, d = view_rays(camera(), 64, 64)
+    p = np.array([0, 0, 2.5]) - d * (2.5 / d[..., 2:])
+    r = d * [1, 1, -1]
+    c = np.array([0.5, 0.5, 2.5]) - p
+    away = np.linalg.norm(c - r * (c * r).sum(-1, keepdims=True), axis=-1)
+    seen = planes["beauty"][..., 0]
+    assert seen[away < 0.19].min() > 0.98 * 4.0
+    assert seen[away > 0.21].max() < 1e-6
+
+
+# --- Cut-outs ---------------------------------------------------------------------------------------------------------
+
+
+def holes() -> Texture:
+    """Left half clear, right half solid, in alpha."""
+    pixels = np.ones((8, 8, 4), np.float32)
+    pixels[:, :4, 3] = 0.0
+    return Texture("holes", pixels)
+
+
+def half_clear(**fields: Any) -> Material:
+    opacity = Source(texture=0, channel=Channel.A, uv_primvar="st", wrap=(Wrap.CLAMP, Wrap.CLAMP))
+    return material("/leaf", OPACITY=opacity, EMISSIVE=3.0, **fields)
+
+
+def test_a_cut_out_lets_view_rays_through_its_holes() -> None:
+    wall = quad("/wall", np.array(CARD) * 4 - [0, 0, 1], 1)
+    leaf = half_clear(opacity_threshold=0.5)
+    planes = draw(scene([quad("/leaf", CARD), wall], [leaf, material("/m", EMISSIVE=1.0)], textures=(holes(),)))
+    row = planes["beauty"][32, :, 0]
+    # The leaf spans 2 of the 2.5 m seen: pixels 6.4 to 57.6; its middle is the middle of the picture.
+    assert (row[:31] == 1.0).all()
+    assert (row[33:57] == 3.0).all()
+    assert (row[59:] == 1.0).all()
+
+
+def test_a_cut_out_lets_light_through_its_holes() -> None:
+    """Sun straight down on a leaf at height 1: its solid half, x > 0, is the shadow."""
+    leaf = quad("/leaf", [(-1, 1, 1), (1, 1, 1), (1, 1, -1), (-1, 1, -1)])
+    floor = quad("/floor", [(-9, 0, 9), (9, 0, 9), (9, 0, -9), (-9, 0, -9)], 1)
+    sun = light(LightKind.DISTANT, (0, 5, 0), (0, -1, 0), (0.0, 0))
+    planes = draw(
+        scene([leaf, floor], [half_clear(opacity_threshold=0.5), material("/m", DIFFUSE=1.0)], textures=(holes(),),
+              lights=(sun,), cameras=(camera((0, 0.9, 4), (0, 0.3, 0)),)), 64, 64,
+    )  # fmt: skip
+    ground = np.isfinite(planes["Z"]) & (np.abs(planes["P"][..., 1]) < 1e-4)
+    x, z = planes["P"][ground][:, 0], planes["P"][ground][:, 2]
+    lit = planes["beauty"][ground][:, 0] > 0
+    under = (np.abs(z) < 0.95) & (np.abs(x) < 0.95)
+    assert (under & (x > 0.1)).any()
+    assert not lit[under & (x > 0.1)].any()
+    assert lit[under & (x < -0.1)].all()
+    assert lit[(np.abs(z) > 1.05) | (np.abs(x) > 1.05)].all()
+
+
+@pytest.mark.parametrize("coverage", [0.25, 0.7])
+def test_presence_averages_to_its_coverage(coverage: float) -> None:
+    """A veil of radiance 3 before a wall of radiance 1: mean 3 c + (1 - c). 40 x 40 pixels x 8 samples: the standard
+    error is 2 sqrt(c (1 - c) / 12800) < 0.009; five of those are allowed."""
+    veil = material("/veil", OPACITY=coverage, EMISSIVE=3.0, opacity_presence=True)
+    wall = quad("/wall", np.array(CARD) * 4 - [0, 0, 1], 1)
+    what = scene([quad("/veil", np.array(CARD) * 2), wall], [veil, material("/m", EMISSIVE=1.0)])
+    planes = draw(what, 40, 40, samples=8)
+    assert planes["beauty"][..., 0].mean() == pytest.approx(3 * coverage + 1 - coverage, abs=0.045)
+    assert not planes["mask"].any()
+
+
+def test_glass_is_left_out_of_mirrors() -> None:
+    """Opaque surfaces reflect the opaque scene only: a mirror shows the room as if the glass were not there."""
+    walls, materials = position_room()
+    chrome = material("/chrome", DIFFUSE=1.0, METALLIC=1.0, ROUGHNESS=0.0)
+    mirror = quad("/mirror", CARD, 1)
+    ball = Sphere("/ball", (0, 0, 2.9), 0.05, 2)  # behind the eye
+    with_glass = scene([*walls, mirror], [*materials, chrome, glass(Model.TRACED)], [ball])
+    without = scene([*walls, mirror], [*materials, chrome])
+    np.testing.assert_array_equal(draw(with_glass)["beauty"], draw(without)["beauty"])
