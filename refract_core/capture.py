@@ -86,7 +86,7 @@ def _glass(scene: Scene) -> dict[int, tuple[NDArray[np.float64], NDArray[np.floa
 def _mask_of(scene: Scene, probe: Probe, sets: list[frozenset[str] | None]) -> int:
     baked = probe.mode != "realtime"
     if probe.captured is None or len(sets) >= _MAX_SETS:
-        return OPAQUE_STATIC if baked else OPAQUE
+        return int(OPAQUE_STATIC if baked else OPAQUE)
     wanted = set(probe.captured)
     things = [(m.path, m.static) for m in scene.meshes] + [(s.path, s.static) for s in scene.spheres]
     seen = frozenset(prim_of(path) for path, static in things if prim_of(path) in wanted and (static or not baked))
@@ -120,7 +120,7 @@ def _add_own(
     base = len(entries)
     for i in chosen:
         proxy = scene.bounds if drawn else tuple(tuple(side) for side in alone[things[i]])
-        entries.append(Entry(_own_probe(centres[i], proxy, height), True, OPAQUE, drawn))
+        entries.append(Entry(_own_probe(centres[i], proxy, height), True, int(OPAQUE), drawn))
     for thing, group in zip(things, nearest, strict=True):
         thing_probe[thing] = base + group
 

@@ -23,24 +23,29 @@ from .errors import EmbreeError, SceneError
 from .kernel import inlined
 
 # Ray masks: what a ray may see. A geometry carries one of the first five, and one of the rest per captured set.
-SOLID_STATIC = 1
-SOLID_MOVING = 2
-CUTOUT_STATIC = 4
-CUTOUT_MOVING = 8
-REFRACTIVE = 16
+# numpy scalars, because numba compiles a function anew for every Python constant it is called with.
+SOLID_STATIC = np.int64(1)
+SOLID_MOVING = np.int64(2)
+CUTOUT_STATIC = np.int64(4)
+CUTOUT_MOVING = np.int64(8)
+REFRACTIVE = np.int64(16)
 FIRST_CAPTURED_BIT = 5
 SOLID = SOLID_STATIC | SOLID_MOVING
 CUTOUT = CUTOUT_STATIC | CUTOUT_MOVING
 OPAQUE = SOLID | CUTOUT
 OPAQUE_STATIC = SOLID_STATIC | CUTOUT_STATIC
-EVERYTHING = -1
+EVERYTHING = np.int64(-1)
+
+# Whether the rays of a packet stay together: Embree then culls with their common frustum.
+COHERENT = np.bool_(True)
+SCATTERED = np.bool_(False)
 
 LANES = 8
 """Rays of a packet, a block of 4x2 pixels. Eight is native from AVX2 on; sixteen only with AVX-512, and elsewhere
 Embree takes such a packet apart ray by ray (docs/decisions/packets-of-eight.md)."""
 BLOCK_WIDTH, BLOCK_HEIGHT = 4, 2
 _INVALID = -1  # RTC_INVALID_GEOMETRY_ID as int32
-_COHERENT = 1 << 16  # RTC_RAY_QUERY_FLAG_COHERENT
+_COHERENT_FLAG = 1 << 16  # RTC_RAY_QUERY_FLAG_COHERENT
 _TRIANGLE, _SPHERE_POINT = 0, 50  # RTCGeometryType
 _INDEX, _VERTEX = 0, 1  # RTCBufferType
 _UINT3, _FLOAT3, _FLOAT4 = 0x5003, 0x9003, 0x9004  # RTCFormat
@@ -160,7 +165,7 @@ class Bvh:
         else:
             geometry = lib.rtcNewGeometry(device, _SPHERE_POINT)
             lib.rtcSetSharedGeometryBuffer(geometry, _VERTEX, 0, _FLOAT4, array.ctypes.data, 0, 16, 1)
-        lib.rtcSetGeometryMask(geometry, part.mask & 0xFFFFFFFF)
+        lib.rtcSetGeometryMask(geometry, int(part.mask) & 0xFFFFFFFF)
         lib.rtcCommitGeometry(geometry)
         lib.rtcAttachGeometryByID(scene, geometry, identifier)
         lib.rtcReleaseGeometry(geometry)
@@ -273,7 +278,7 @@ def intersect(packet, scene, coherent):  # type: ignore[no-untyped-def]
     """Nearest hit of every active lane; GEOM is -1 where there is none. T_FAR becomes the hit distance."""
     if _active(packet) == 0:
         return
-    packet.arguments[0] = _COHERENT if coherent else 0
+    packet.arguments[0] = _COHERENT_FLAG if coherent else 0
     _rtc_intersect8(packet.valid.ctypes.data, scene, packet.rays.ctypes.data, packet.arguments.ctypes.data)
 
 
@@ -282,5 +287,5 @@ def occluded(packet, scene, coherent):  # type: ignore[no-untyped-def]
     """Any hit of every active lane: T_FAR becomes -inf where something is in the way."""
     if _active(packet) == 0:
         return
-    packet.arguments[0] = _COHERENT if coherent else 0
+    packet.arguments[0] = _COHERENT_FLAG if coherent else 0
     _rtc_occluded8(packet.valid.ctypes.data, scene, packet.rays.ctypes.data, packet.arguments.ctypes.data)

@@ -156,7 +156,7 @@ def _walk(exits, packet, world, ior):  # type: ignore[no-untyped-def]
             set_ray(packet, lane, p, d, 0.0, math.inf, REFRACTIVE | OPAQUE)
         if not waiting:
             break
-        intersect_world(packet, world, exits.segment, event == 0)
+        intersect_world(packet, world, exits.segment, np.bool_(event == 0))
         for lane in range(LANES):
             if packet.valid[lane] != 0:
                 _meet(exits, lane, packet, world, ior)

@@ -12,6 +12,7 @@ from .camera import pixel_ray
 from .embree import (
     BLOCK_HEIGHT,
     BLOCK_WIDTH,
+    COHERENT,
     EVERYTHING,
     GEOM,
     HIT_U,
@@ -132,7 +133,7 @@ def opaque_tile(world, view, scratch, tile, sample, layer, first):  # type: igno
                 if x < width and y < height:
                     far[lane] = add_view_ray(packet, view, lane, x, y, 0.0, math.inf, EVERYTHING)
                     block.pixel[lane, 0], block.pixel[lane, 1] = x, y
-            intersect_world(packet, world, far, True)
+            intersect_world(packet, world, far, COHERENT)
             behind = False
             for lane in range(LANES):
                 x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
@@ -165,7 +166,7 @@ def _trace_behind_glass(packet, world, view, x0, y0, far, block, spread):  # typ
         if kept[lane] != 0 and packet.words[GEOM, lane] >= 0 and _is_refractive(world, packet, lane):
             x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
             far[lane] = add_view_ray(packet, view, lane, x, y, 0.0, math.inf, OPAQUE)
-    intersect_world(packet, world, far, True)
+    intersect_world(packet, world, far, COHERENT)
     for lane in range(LANES):
         packet.valid[lane] = kept[lane]
     load_hits(block, packet, world, spread)
@@ -223,7 +224,7 @@ def peel_tile(world, view, scratch, tile, depth, previous, layer):  # type: igno
 def _peel_block(world, packet, far, layer, x0, y0):  # type: ignore[no-untyped-def]
     entered = 0
     for _ in range(_MAX_SKIPS):
-        intersect_world(packet, world, far, True)
+        intersect_world(packet, world, far, COHERENT)
         again = False
         for lane in range(LANES):
             if packet.valid[lane] == 0:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .embree import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, clear, set_ray
+from .embree import BLOCK_HEIGHT, BLOCK_WIDTH, COHERENT, LANES, clear, set_ray
 from .environment import radiance
 from .kernel import inlined, kernel
 from .scene import Probe
@@ -281,7 +281,7 @@ def capture_rows(world, table, scratch, k, face, y0, y1, mask, near, far, sample
                     stretch = length(d)
                     limit[lane] = far * stretch
                     set_ray(packet, lane, centre, scale(d, 1.0 / stretch), near * stretch, limit[lane], mask)
-                intersect_world(packet, world, limit, True)
+                intersect_world(packet, world, limit, COHERENT)
                 load_hits(block, packet, world, 2.0 / res)
                 shade(block, second, packet, world, sample, mask)
                 _keep_texels(table, k, face, bx, by, block, 1.0 / samples)

@@ -19,7 +19,7 @@ from .optics_scalar import channel_iors, fresnel_dielectric, reflect, transmitte
 from .scene import Param
 from .shading import gather, load_surface
 from .surface import float_input, material_of
-from .tiers import ask
+from .tiers import BY_MARCH, ask
 from .tracing import off_surface
 from .vec import dot, row, scale
 
@@ -113,8 +113,8 @@ def refract_tile(world, screen, probes, thing_probe, choices, scratch, tile, sam
                 if channels == 1 or channel == 1:
                     _note_transmission(planes, front, sample, query, exits, x0, y0)
             _query_reflections(query, block, parts, world)
-            ask(query, choices.tiers, False, screen, probes, thing_probe, z_self, block, second, third, packet, world,
-                sample)  # fmt: skip
+            ask(query, choices.tiers, BY_MARCH, screen, probes, thing_probe, z_self, block, second, third,
+                packet, world, sample)  # fmt: skip
             _composite(result, planes, front, sample, query, exits, block, through, opacity, z_self, x0, y0)
     return packet.tally[0]
 

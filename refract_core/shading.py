@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .bsdf import MIRROR_ALPHA, directional_albedo, sample_half_vector
-from .embree import GEOM, HIT_U, HIT_V, LANES, PRIM, T_FAR, clear, set_ray
+from .embree import GEOM, HIT_U, HIT_V, LANES, PRIM, SCATTERED, T_FAR, clear, set_ray
 from .environment import irradiance, prefiltered, sample_direction
 from .kernel import inlined
 from .lights import CAMERA_LIGHT, highlight, irradiance_factor, shadow_ray
@@ -307,7 +307,7 @@ def shade(block, second, packet, world, sample, mask):  # type: ignore[no-untype
         # Where the mirror ray of a lane goes is needed after the packet has been reused.
         block.scratch[1, lane] = packet.valid[lane]
         put(block.specular, lane, (packet.rays[4, lane], packet.rays[5, lane], packet.rays[6, lane]))
-    intersect_world(packet, world, far, False)
+    intersect_world(packet, world, far, SCATTERED)
     load_hits(second, packet, world, 0.0)
     _shade_without_bounce(second, packet, world, sample, mask)
     for lane in range(LANES):

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .kernel import inlined, leaf
+from .kernel import inlined
 from .scene import Channel, Param
 from .textures import sample
 from .vec import add, along, cross, dot, flip_towards, length, normalize, row, scale, sub
@@ -162,7 +162,7 @@ def _textured(geometry, materials, textures, hit, m, i):  # type: ignore[no-unty
     return (r, g, b, a)
 
 
-@leaf
+@inlined
 def color_input(geometry, materials, textures, hit, m, i):  # type: ignore[no-untyped-def]
     """Value of input `i` of material `m` at a hit, as three floats."""
     if (materials.driven[m] >> i) & 1 == 0:
@@ -185,7 +185,7 @@ def _driven_color(geometry, materials, textures, hit, m, i):  # type: ignore[no-
     return (c[0] * s[0] + b[0], c[1] * s[1] + b[1], c[2] * s[2] + b[2])
 
 
-@leaf
+@inlined
 def float_input(geometry, materials, textures, hit, m, i):  # type: ignore[no-untyped-def]
     """Value of a scalar input `i` of material `m` at a hit."""
     if (materials.driven[m] >> i) & 1 == 0:

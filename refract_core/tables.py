@@ -213,8 +213,9 @@ def prim_of(path: str) -> str:
 
 def _mask(material: Material, static: bool, path: str, captured_sets: Sequence[frozenset[str] | None]) -> int:
     if material.refractive:
-        return REFRACTIVE
-    mask = (CUTOUT_STATIC if static else CUTOUT_MOVING) if material.cutout else SOLID_STATIC if static else SOLID_MOVING
+        return int(REFRACTIVE)
+    still, moving = (CUTOUT_STATIC, CUTOUT_MOVING) if material.cutout else (SOLID_STATIC, SOLID_MOVING)
+    mask = int(still if static else moving)
     for k, paths in enumerate(captured_sets):
         if paths is None or prim_of(path) in paths:
             mask |= 1 << (FIRST_CAPTURED_BIT + k)

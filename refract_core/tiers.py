@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .embree import LANES, OPAQUE, clear, set_ray
+from .embree import LANES, OPAQUE, SCATTERED, clear, set_ray
 from .environment import radiance
 from .kernel import inlined
 from .optics_scalar import probe_lod_hdrp, screen_lod_hdrp
@@ -25,8 +25,11 @@ from .volumes import update_headroom
 
 SCREEN, RAY, PROBE, SKY = 0, 1, 2, 3
 """Codes of `settings.TIERS`, in its order."""
+BY_MARCH = np.bool_(False)
+"""For `ask`: reflections march also where refraction goes by proxy, as HDRP's own do."""
 NONE = 4
 """Column of the weights for what no tier answered."""
+EMBEDDED_ONLY, ALL_RAYS = np.bool_(True), np.bool_(False)
 _ROUGH_RAY = 3  # purpose of the sampling sequence
 _SPENT = 1.0 - 1e-6
 
@@ -95,11 +98,11 @@ def ask(query, order, hdrp, screen, probes, thing_probe, z_self, block, second, 
         query.confidence[lane] = 0.0
         inside = inside or (query.on[lane] != 0 and query.embedded[lane] != 0)
     if inside:
-        _ask_rays(query, True, block, second, third, packet, world, sample)
+        _ask_rays(query, EMBEDDED_ONLY, block, second, third, packet, world, sample)
     for i in range(order.shape[0]):
         tier = order[i]
         if tier == RAY:
-            _ask_rays(query, False, block, second, third, packet, world, sample)
+            _ask_rays(query, ALL_RAYS, block, second, third, packet, world, sample)
             continue
         sky_follows = False
         for j in range(i + 1, order.shape[0]):
@@ -183,7 +186,7 @@ def _ask_rays(query, embedded, block, second, third, packet, world, sample):  # 
         set_ray(packet, lane, row(query.origin, lane), d, 0.0, math.inf, OPAQUE)
     if not some:
         return
-    intersect_world(packet, world, third.scratch[0], False)
+    intersect_world(packet, world, third.scratch[0], SCATTERED)
     load_hits(second, packet, world, 0.0)
     shade(second, third, packet, world, sample, OPAQUE)
     for lane in range(LANES):

@@ -5,12 +5,14 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from .embree import (
+    COHERENT,
     CUTOUT,
     GEOM,
     HIT_U,
     HIT_V,
     LANES,
     PRIM,
+    SCATTERED,
     SOLID,
     T_FAR,
     T_NEAR,
@@ -100,7 +102,7 @@ def intersect_world(packet, world, far, coherent):  # type: ignore[no-untyped-de
                 again = True
         if not again:
             break
-        intersect(packet, handle, False)
+        intersect(packet, handle, SCATTERED)
     for lane in range(LANES):
         packet.valid[lane] = traced[lane]
 
@@ -123,7 +125,7 @@ def visible(packet, world, mask, result):  # type: ignore[no-untyped-def]
         far[lane] = packet.rays[T_FAR, lane]
         if packet.valid[lane] != 0:
             packet.words[9, lane] = mask & ~CUTOUT
-    occluded(packet, world.geometry.handle, True)
+    occluded(packet, world.geometry.handle, COHERENT)
     if not world.cutouts:
         for lane in range(LANES):
             blocked = packet.valid[lane] != 0 and packet.rays[T_FAR, lane] < 0.0
@@ -135,7 +137,7 @@ def visible(packet, world, mask, result):  # type: ignore[no-untyped-def]
         if packet.valid[lane] != 0 and packet.rays[T_FAR, lane] < 0.0:
             packet.valid[lane] = 0
         packet.words[9, lane] = mask & CUTOUT
-    intersect_world(packet, world, far, False)
+    intersect_world(packet, world, far, SCATTERED)
     for lane in range(LANES):
         free = packet.valid[lane] != 0 and packet.words[GEOM, lane] < 0
         result[lane] = 1.0 if traced[lane] == 0 or free else 0.0

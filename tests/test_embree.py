@@ -77,7 +77,7 @@ def test_a_ray_beside_the_triangle_misses() -> None:
 def test_masks_choose_what_a_ray_sees() -> None:
     """Glass at z = 1 in front of a wall at z = 0: each ray sees the nearest thing that its mask shares a bit with."""
     points = np.concatenate([square_at(0), square_at(1)])
-    bvh = Bvh(points, [Part(embree.SOLID_STATIC, QUAD), Part(embree.REFRACTIVE, QUAD + np.uint32(4))])
+    bvh = Bvh(points, [Part(int(embree.SOLID_STATIC), QUAD), Part(int(embree.REFRACTIVE), QUAD + np.uint32(4))])
     masks = [embree.OPAQUE, embree.REFRACTIVE, embree.EVERYTHING, embree.CUTOUT]
     hit = shoot(bvh, [(0.3, 0.2, 5)] * 4, [(0, 0, -1)] * 4, masks)
     assert hit.words[embree.GEOM, :4].tolist() == [0, 1, 1, -1]
@@ -85,7 +85,7 @@ def test_masks_choose_what_a_ray_sees() -> None:
 
 
 def test_occlusion_obeys_masks_and_distance() -> None:
-    bvh = Bvh(SQUARE, [Part(embree.SOLID_STATIC, QUAD)])
+    bvh = Bvh(SQUARE, [Part(int(embree.SOLID_STATIC), QUAD)])
     packet = packet_of([(0, 0.1, 2)] * 3, [(0, 0, -1)] * 3, [embree.OPAQUE, embree.REFRACTIVE, embree.OPAQUE])
     packet.rays[embree.T_FAR, :3] = [math.inf, math.inf, 1.9]
     anything(Pointer(packet), bvh.handle, True)

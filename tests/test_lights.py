@@ -135,9 +135,7 @@ def test_distant_light(degrees: float, angle: float) -> None:
 @pytest.mark.parametrize("size", [0.0, 0.01])
 def test_inverse_square(kind: LightKind, size: float) -> None:
     """Twice as far is a quarter, for points exactly and for small lights to (size / distance)^2."""
-    near, far = (
-        factor(light(kind, (0, h, 0), (0, -1, 0), (size, size)), (0, 0, 0), (0, 1, 0))[0] for h in (1.0, 2.0)
-    )
+    near, far = (factor(light(kind, (0, h, 0), (0, -1, 0), (size, size)), (0, 0, 0), (0, 1, 0))[0] for h in (1.0, 2.0))
     assert near / far == pytest.approx(4.0, rel=1e-3)
 
 

@@ -67,7 +67,7 @@ def picture_of(planes: list[tuple[ArrayLike, ArrayLike, float]], lens: Camera = 
         screen.normal[seen] = np.where((d[seen] @ n)[:, None] < 0, n, -n)
     screen.depth[: WIDTH * HEIGHT] = depth.ravel()
     nearest_levels(screen.depth, screen.depth_level)
-    return Screen(view_of(lens, WIDTH, HEIGHT), screen)
+    return Screen(view_of(lens, WIDTH, HEIGHT), *screen)
 
 
 WALL = ((0, 0, -4), (0, 0, 1), 99.0)

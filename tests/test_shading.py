@@ -82,8 +82,7 @@ def test_white_metal_shows_a_room_of_one_radiance(roughness: float) -> None:
 
 @pytest.mark.parametrize("albedo", [1.0, 0.5, 0.1])
 def test_a_matt_ball_under_a_constant_dome_is_its_albedo(albedo: float) -> None:
-    """Furnace: irradiance pi L on a convex body, so radiance albedo L. A surface of ior 1 has no Fresnel share; what
-    is left of the gloss is the error of Karis' fit at F0 = 0, under 0.3 %."""
+    """Furnace: irradiance pi L on a convex body, so radiance albedo L. A surface of ior 1 has no Fresnel share."""
     ball = Sphere("/ball", (0, 0, 0), 0.8, 0)
     planes = draw(scene([], [material("/m", DIFFUSE=albedo)], [ball], environment=dome(2.0)))
     surface = np.isfinite(planes["Z"])

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +13,14 @@ from pxr import Usd, UsdGeom
 from ..scene import F32, F64, U32, Notice
 from . import gprims
 from .primvars import Corners, Topology, Unusable, as_values, evaluate, to_corners
-from .triangulate import Index, Triangles, is_closed, smooth_normals, triangulate, turned_over
+from .triangulate import Index, Triangles, fans, fans_fit, is_closed, smooth_normals, triangulate, turned_over
 
 SUBDIVIDED = (UsdGeom.Tokens.catmullClark, UsdGeom.Tokens.loop)
 _MESH_ATTRIBUTES = ("points", "faceVertexCounts", "faceVertexIndices", "holeIndices", "normals")
 _LARGEST = 1.0e15
 """Coordinates beyond it are taken for garbage: their squares still fit float32."""
+_SMALL = 512
+"""Face corners up to which a topology is kept: many small meshes are the same few shapes."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,40 @@ class _Faces:
     """Face corners of the prim, good or bad"""
     faults: dict[str, int]
     """What was left out, and how many"""
+    known: _Topology | None = None
+    """What was found out already about a mesh of the same topology"""
+
+
+class _Topology(NamedTuple):
+    """Counts and indices with nothing wrong in them, and what follows from them alone."""
+
+    counts: Index
+    indices: Index
+    starts: Index
+    faces: Index
+    cut: Triangles
+    """Every polygon as a fan from its first corner"""
+    vertices: Index
+    """shape (T, 3): the points of `cut`"""
+    loops: tuple[Index, ...]
+    """Corners of the polygons, shape (F, n) for each n"""
+    used: int
+    """Points in use: these are the first so many"""
+    closed: bool
+    """By the indices alone"""
+
+
+@lru_cache(maxsize=1024)
+def _topology(count_bytes: bytes, index_bytes: bytes) -> _Topology | None:
+    """A small mesh's topology; None where some polygon or index needs a closer look."""
+    counts, indices = np.frombuffer(count_bytes, np.int64), np.frombuffer(index_bytes, np.int64)
+    used = int(indices.max()) + 1 if len(indices) else 0
+    if counts.min() < 3 or counts.sum() != len(indices) or not np.array_equal(np.unique(indices), np.arange(used)):
+        return None
+    starts = np.cumsum(counts) - counts
+    cut, loops = fans(starts, counts)
+    closed = is_closed(np.zeros((1, 3), np.float32), indices, starts, counts)
+    return _Topology(counts, indices, starts, np.arange(len(counts)), cut, indices[cut.corners], loops, used, closed)
 
 
 def _read_mesh(mesh: UsdGeom.Mesh, time: Usd.TimeCode, notices: list[Notice]) -> Shape:
@@ -99,9 +136,14 @@ def _read_mesh(mesh: UsdGeom.Mesh, time: Usd.TimeCode, notices: list[Notice]) ->
     cut = _cut(faces, str(mesh.GetPath()), notices)
     left_handed = mesh.GetOrientationAttr().Get(time) == UsdGeom.Tokens.leftHanded
     corners = turned_over(cut.corners) if left_handed else cut.corners
-    vertices = faces.indices[corners]
+    known = faces.known
+    if known is not None and corners is known.cut.corners:
+        vertices = known.vertices
+        points, triangles = faces.points, vertices
+    else:
+        vertices = faces.indices[corners]
+        points, triangles = _compact(faces.points, vertices)
     topology = Topology(corners, vertices, cut.faces, faces.corner_total, len(faces.points), faces.total)
-    points, triangles = _compact(faces.points, vertices)
     cage = mesh.GetSubdivisionSchemeAttr().Get(time) in SUBDIVIDED
     if cage:
         normals: Corners | None = Corners(smooth_normals(points, triangles), triangles)
@@ -112,7 +154,8 @@ def _read_mesh(mesh: UsdGeom.Mesh, time: Usd.TimeCode, notices: list[Notice]) ->
         triangles=np.ascontiguousarray(triangles, np.uint32),
         normals=_mended(normals, points, triangles),
         topology=topology,
-        closed=is_closed(faces.points, faces.indices, faces.starts, faces.counts),
+        closed=(known is not None and known.closed)
+        or is_closed(faces.points, faces.indices, faces.starts, faces.counts),
         double_sided=bool(mesh.GetDoubleSidedAttr().Get(time)),
         varying=_varies(mesh.GetPrim(), _MESH_ATTRIBUTES),
         cage=cage,
@@ -125,6 +168,8 @@ def _cut(faces: _Faces, path: str, notices: list[Notice]) -> Triangles:
     Raises:
         Unusable: where none is left.
     """
+    if faces.known is not None and fans_fit(faces.points, faces.indices, faces.known.loops):
+        return faces.known.cut
     cut = triangulate(faces.points, faces.indices, faces.starts, faces.counts, faces.faces)
     drawn = np.bincount(cut.faces, minlength=faces.total)[faces.faces] > 0
     faults = dict(faces.faults)
@@ -156,11 +201,16 @@ def _usable_faces(mesh: UsdGeom.Mesh, time: Usd.TimeCode) -> _Faces:
         raise Unusable("it has no points at this time")
     if not len(counts):
         raise Unusable("it has no faces at this time")
+    holes = _integers(mesh.GetHoleIndicesAttr().Get(time))
+    if len(indices) <= _SMALL and not len(holes):
+        known = _topology(counts.tobytes(), indices.tobytes())
+        if known is not None and known.used == len(values) and _tame(values):
+            shared = known.indices, known.starts, known.counts, known.faces
+            return _Faces(values, *shared, len(counts), len(indices), {}, known)
     if counts.min() < 0:
         raise Unusable(f"faceVertexCounts has {int((counts < 0).sum())} negative values")
     ends = np.cumsum(counts)
     starts = ends - counts
-    holes = _integers(mesh.GetHoleIndicesAttr().Get(time))
     if counts.min() >= 3 and ends[-1] == len(indices) and not len(holes) and _sound(values, indices):
         return _Faces(values, indices, starts, counts, np.arange(len(counts)), len(counts), len(indices), {})
     faults: dict[str, int] = {}
@@ -177,18 +227,22 @@ def _usable_faces(mesh: UsdGeom.Mesh, time: Usd.TimeCode) -> _Faces:
     if wild.any():
         bad = _any_of_face(wild[np.where(wrong, 0, indices)], starts, counts)
         _exclude(usable, ~bad, "faces with points that are NaN, infinite or over 1e15", faults)
-    known = (holes >= 0) & (holes < len(counts))
-    if not known.all():
-        faults["holeIndices that name no face"] = int((~known).sum())
-    usable[holes[known]] = False
+    named = (holes >= 0) & (holes < len(counts))
+    if not named.all():
+        faults["holeIndices that name no face"] = int((~named).sum())
+    usable[holes[named]] = False
     faces = np.flatnonzero(usable)
     return _Faces(values, indices, starts[faces], counts[faces], faces, len(counts), len(indices), faults)
 
 
 def _sound(points: F32, indices: Index) -> bool:
     """Nothing wrong with any of them."""
-    inside = indices.min() >= 0 and indices.max() < len(points)
-    return bool(inside and points.min() >= -_LARGEST and points.max() <= _LARGEST)
+    return bool(indices.min() >= 0 and indices.max() < len(points)) and _tame(points)
+
+
+def _tame(points: F32) -> bool:
+    """No NaN, no infinity, nothing beyond `_LARGEST`."""
+    return bool(points.min() >= -_LARGEST and points.max() <= _LARGEST)
 
 
 def _exclude(usable: NDArray[np.bool_], good: NDArray[np.bool_], why: str, faults: dict[str, int]) -> None:

@@ -59,6 +59,28 @@ def triangulate(points: F32, indices: Index, starts: Index, counts: Index, faces
     return Triangles(corners[order], owners[order])
 
 
+def fans(starts: Index, counts: Index) -> tuple[Triangles, tuple[Index, ...]]:
+    """Every polygon as a fan from its first corner, in order, and the corners of the polygons of each size."""
+    loops, corners, owners = [], [], []
+    for count in np.unique(counts):
+        chosen = np.flatnonzero(counts == count)
+        loops.append(starts[chosen][:, None] + np.arange(count))
+        part = _ordered(_fan(loops[-1]), chosen)
+        corners.append(part.corners)
+        owners.append(part.faces)
+    faces = np.concatenate(owners)
+    order = np.argsort(faces, kind="stable")
+    return Triangles(np.concatenate(corners)[order], faces[order]), tuple(loops)
+
+
+def fans_fit(points: F32, indices: Index, loops: tuple[Index, ...]) -> bool:
+    """Whether `triangulate` would cut all of these polygons as `fans` does, with nothing left out."""
+    return all(
+        (has_area(points, indices[group]) if group.shape[1] == 3 else _fan_fits(points, indices, group)).all()
+        for group in loops
+    )
+
+
 def _cut(points: F32, indices: Index, loops: Index, faces: Index) -> Triangles:
     """Polygons of one size, `loops` shape (F, n) of corners."""
     size = loops.shape[1]
