@@ -138,7 +138,7 @@ def _own_probe(centre: NDArray[np.float64], proxy: Any, height: int) -> Probe:
         capture_point=(float(centre[0]), float(centre[1]), float(centre[2])),
         influence=Volume(here, False, (_EVERYWHERE,) * 3),
         proxy=Volume(frame, False, (float(half[0]), float(half[1]), float(half[2]))),
-        resolution=1 << min(9, max(5, round(math.log2(max(height, 1) / 3)))),
+        resolution=1 << min(9, max(5, round(math.log2(max(height, 1) / 5)))),
         clipping=(1e-4, 1e9),
     )
 

@@ -12,13 +12,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .embree import GEOM, HIT_U, HIT_V, LANES, OPAQUE, PRIM, REFRACTIVE, T_FAR, clear, set_ray
+from .embree import COHERENT, GEOM, HIT_U, HIT_V, LANES, OPAQUE, PRIM, REFRACTIVE, SCATTERED, T_FAR, clear, set_ray
 from .kernel import inlined
 from .optics_scalar import THIN_THICKNESS, box_model, reflect, refract, sphere_model, thin_model, transmittance
 from .scene import Model, Param
 from .surface import color_input, float_input, hit_at, material_of, normal_input
 from .tracing import intersect_world, off_surface
-from .vec import dot, flip_towards, mul, row, scale
+from .vec import along, dot, flip_towards, mul, normalize, row, scale, sub
 
 MAX_EVENTS = 24
 """Interfaces that one walked ray may meet."""
@@ -52,6 +52,10 @@ class Exits(NamedTuple):
     """part number of the medium the ray is in, or -1"""
     segment: Any
     """shape (8,): T_FAR to start with"""
+    hit: Any
+    """shape (8, 3): u, v and distance of the interface a walk has met"""
+    met: Any
+    """shape (8, 2): its part, -1 for none, and primitive"""
     unanswered: Any
     """shape (8,): the share of the light from the exit that no tier knew"""
 
@@ -61,7 +65,8 @@ def new_exits() -> Exits:
     z = np.zeros
     return Exits(
         z(LANES, np.int32), z(LANES, np.int32), z(LANES), z(LANES), z((LANES, 3)), z(LANES), z((LANES, 3)),
-        z((LANES, 3)), z(LANES), z((LANES, 3)), z(LANES, np.int32), z(LANES, np.int32), z(LANES), z(LANES),
+        z((LANES, 3)), z(LANES), z((LANES, 3)), z(LANES, np.int32), z(LANES, np.int32), z(LANES), z((LANES, 3)),
+        z((LANES, 2), np.int64), z(LANES),
     )  # fmt: skip
 
 
@@ -78,6 +83,8 @@ def load_medium(exits, lane, hit, world, override):  # type: ignore[no-untyped-d
     g, mt, tx = world.geometry, world.materials, world.textures
     m = material_of(g, hit.part, hit.primitive)
     model = mt.model[m] if override < 0 else override
+    if model == Model.TRACED.value and g.sheet[hit.part] != 0:
+        model = Model.THIN.value  # an open mesh has no far side to find; `open_meshes` says so to the user
     thickness = max(MIN_THICKNESS, float_input(g, mt, tx, hit, m, Param.THICKNESS.value))
     distance = float(mt.absorption_distance[m])
     if model == Model.THIN.value:
@@ -91,10 +98,11 @@ def load_medium(exits, lane, hit, world, override):  # type: ignore[no-untyped-d
 
 
 @inlined
-def find_exits(exits, block, hits, packet, world, ior):  # type: ignore[no-untyped-def]
+def find_exits(exits, block, hits, packet, world, ior, measured):  # type: ignore[no-untyped-def]
     """Fill point, direction, path_length, transmittance and status of every lane that is on.
 
     Args:
+        measured: look for opaque objects between a model's entry and exit, which HDRP does not.
         block: the entries: point, ng, ns (on the viewer's side), wo.
         hits: shape (8,) part numbers of the entries.
         ior: shape (8,), the index to use (a colour channel's, under dispersion).
@@ -123,8 +131,34 @@ def find_exits(exits, block, hits, packet, world, ior):  # type: ignore[no-untyp
         exits.path_length[lane] = length
         t = transmittance(row(exits.color, lane), exits.absorption_distance[lane], length)
         _put(exits.transmittance, lane, t)
+    if measured:
+        _stop_at_opaque(exits, block, packet, world)
     if walks:
         _walk(exits, packet, world, ior)
+
+
+@inlined
+def _stop_at_opaque(exits, block, packet, world):  # type: ignore[no-untyped-def]
+    """A typed thickness may reach through the floor the glass stands on: such rays are EMBEDDED, as in a walk."""
+    clear(packet)
+    for lane in range(LANES):
+        if exits.on[lane] == 0 or exits.status[lane] != LEFT or exits.path_length[lane] <= 0.0:
+            continue
+        p = row(block.point, lane)
+        inside = normalize(sub(row(exits.point, lane), p))
+        exits.segment[lane] = exits.path_length[lane]
+        set_ray(packet, lane, off_surface(p, row(block.ng, lane), inside), inside, 0.0, exits.segment[lane], OPAQUE)
+    intersect_world(packet, world, exits.segment, COHERENT)
+    for lane in range(LANES):
+        if packet.valid[lane] == 0 or packet.words[GEOM, lane] < 0:
+            continue
+        t = float(packet.rays[T_FAR, lane])
+        rays = packet.rays
+        exits.status[lane] = EMBEDDED
+        _put(exits.point, lane, (float(rays[0, lane]), float(rays[1, lane]), float(rays[2, lane])))
+        _put(exits.direction, lane, (float(rays[4, lane]), float(rays[5, lane]), float(rays[6, lane])))
+        exits.path_length[lane] = t
+        _put(exits.transmittance, lane, transmittance(row(exits.color, lane), exits.absorption_distance[lane], t))
 
 
 @inlined
@@ -157,30 +191,57 @@ def _walk(exits, packet, world, ior):  # type: ignore[no-untyped-def]
         if not waiting:
             break
         intersect_world(packet, world, exits.segment, np.bool_(event == 0))
+        _note_interfaces(exits, packet, world)
         for lane in range(LANES):
-            if packet.valid[lane] != 0:
-                _meet(exits, lane, packet, world, ior)
+            if exits.on[lane] != 0 and exits.status[lane] == LOST:
+                _meet(exits, lane, world, ior)
 
 
 @inlined
-def _meet(exits, lane, packet, world, ior):  # type: ignore[no-untyped-def]
+def _note_interfaces(exits, packet, world):  # type: ignore[no-untyped-def]
+    """Keep what a walk's rays have met. Where glass touches an opaque object, as on a table, the two surfaces tie and
+    the ray could come out on the far side of the table: an opaque surface within rounding of the hit takes it."""
+    for lane in range(LANES):
+        exits.met[lane, 0] = -1
+        if packet.valid[lane] == 0:
+            continue
+        t = float(packet.rays[T_FAR, lane])
+        exits.met[lane, 0], exits.met[lane, 1] = packet.words[GEOM, lane], packet.words[PRIM, lane]
+        exits.hit[lane, 0], exits.hit[lane, 1] = packet.rays[HIT_U, lane], packet.rays[HIT_V, lane]
+        exits.hit[lane, 2] = t
+        packet.valid[lane] = 0
+        if exits.met[lane, 0] >= 0 and exits.inside[lane] >= 0:
+            p, d = row(exits.point, lane), row(exits.direction, lane)
+            end = along(p, d, t)
+            near = 4e-5 * max(abs(end[0]), abs(end[1]), abs(end[2])) + 4e-6
+            exits.segment[lane] = t + near
+            set_ray(packet, lane, p, d, max(0.0, t - near), t + near, OPAQUE)
+    intersect_world(packet, world, exits.segment, SCATTERED)
+    for lane in range(LANES):
+        if packet.valid[lane] != 0 and packet.words[GEOM, lane] >= 0:
+            exits.met[lane, 0], exits.met[lane, 1] = packet.words[GEOM, lane], packet.words[PRIM, lane]
+            exits.hit[lane, 0], exits.hit[lane, 1] = packet.rays[HIT_U, lane], packet.rays[HIT_V, lane]
+            exits.hit[lane, 2] = packet.rays[T_FAR, lane]
+
+
+@inlined
+def _meet(exits, lane, world, ior):  # type: ignore[no-untyped-def]
     """One interface of a walk."""
-    part, primitive = packet.words[GEOM, lane], packet.words[PRIM, lane]
+    part, primitive = exits.met[lane, 0], exits.met[lane, 1]
     inside = exits.inside[lane]
     if part < 0:
         exits.status[lane] = LEFT
         return
     g, mt, tx = world.geometry, world.materials, world.textures
     m = material_of(g, part, primitive)
-    t = float(packet.rays[T_FAR, lane])
+    t = exits.hit[lane, 2]
     p, d = row(exits.point, lane), row(exits.direction, lane)
     if mt.model[m] == Model.NONE.value:
         exits.status[lane] = LEFT if inside < 0 else EMBEDDED
         if inside >= 0:
             _absorb(exits, lane, t)
         return
-    u, v = float(packet.rays[HIT_U, lane]), float(packet.rays[HIT_V, lane])
-    hit = hit_at(g, part, primitive, u, v, p, d, t, 0.0)
+    hit = hit_at(g, part, primitive, exits.hit[lane, 0], exits.hit[lane, 1], p, d, t, 0.0)
     leaving = dot(hit.ng, d) > 0.0
     same = inside >= 0 and g.thing[part] == g.thing[inside]
     if inside >= 0 and same and leaving:

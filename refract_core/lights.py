@@ -22,6 +22,7 @@ from .vec import add, cross, dot, frame, length, lerp, normalize, row, scale, su
 CAMERA_LIGHT = 4
 """Kind of the light that stands in where a stage has none: at the eye, without falloff or shadow."""
 _DISK_SIDES = 12
+_SMALLEST_POINT_LOBE = 0.02  # a light without size would be an infinitely bright dot on a mirror
 _DISTANT, _SPHERE, _RECT, _DISK = (int(k) for k in LightKind)
 
 
@@ -62,7 +63,7 @@ def pack_lights(scene: Scene, eye: NDArray[np.float64]) -> LightTable:
         size=np.array(sizes, np.float64).reshape(n, 2),
         radiance=np.array(radiance, np.float64).reshape(n, 3),
         diffuse=np.array([*(light.diffuse for light in scene.lights), 1.0], np.float64)[:n],
-        specular=np.array([*(light.specular for light in scene.lights), 0.0], np.float64)[:n],
+        specular=np.array([*(light.specular for light in scene.lights), 1.0], np.float64)[:n],
     )
 
 
@@ -213,6 +214,8 @@ def _nearest_to_mirror(lights, l, p, r):  # type: ignore[no-untyped-def] # noqa:
         inside = away <= s0 and dot(c, r) > 0.0
         point = add(c, scale(off, min(1.0, s0 / max(away, 1e-12))))
         return point, inside, math.pi * s0 * s0 / d2 if s0 > 0.0 else 1.0 / d2, s0 / math.sqrt(d2)
+    if kind == CAMERA_LIGHT:
+        return c, False, 1.0, 0.0
     facing = -dot(c, face)
     if facing <= 0.0:
         return c, False, 0.0, 0.0
@@ -240,8 +243,6 @@ def _nearest_to_mirror(lights, l, p, r):  # type: ignore[no-untyped-def] # noqa:
 @inlined
 def highlight(lights, l, p, n, wo, alpha):  # type: ignore[no-untyped-def] # noqa: E741
     """Reflected radiance per radiance of light `l`, without Fresnel and shadow, for a GGX surface of width alpha."""
-    if lights.kind[l] == CAMERA_LIGHT:
-        return 0.0
     n_dot_v = dot(n, wo)
     if n_dot_v <= 0.0:
         return 0.0
@@ -253,7 +254,7 @@ def highlight(lights, l, p, n, wo, alpha):  # type: ignore[no-untyped-def] # noq
     sharp = 1.0 - min(1.0, max(0.0, (alpha - 0.005) / 0.045)) if radius > 0.0 else 0.0
     value = sharp if inside else 0.0
     if sharp < 1.0:
-        a = max(alpha, 0.002)
+        a = max(alpha, _SMALLEST_POINT_LOBE if radius == 0.0 else 0.002)
         wi = normalize(point)
         n_dot_l = dot(n, wi)
         if n_dot_l > 0.0:

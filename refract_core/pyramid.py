@@ -2,7 +2,8 @@
 
 Colour: HDRP's chain (fact: MipGenerator and ColorPyramid.compute): each level is a 2x2 average of the one before, then
 a separable 9-tap binomial blur, sizes halved and floored, until both sides of a level are below 8 pixels.
-Depth: the nearest z_depth of each 2x2 cell, sizes halved and *ceiled*, so that no pixel is ever outside its cell.
+Depth: the nearest z_depth of each 2x2 cell, and the farthest that is not background, sizes halved and *ceiled*, so that
+no pixel is ever outside its cell.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ class ScreenBuffers(NamedTuple):
     color_level: NDArray[np.int64]
     """shape (L, 3): first row in the pool, width, height"""
     depth: NDArray[np.float32]
-    """shape (N,)"""
+    """shape (N,): nearest of each cell; level 0 is the depth itself"""
+    farthest: NDArray[np.float32]
+    """shape (N,): farthest of each cell, background left out (0 where there is nothing else); level 0 is not used"""
     depth_level: NDArray[np.int64]
     """shape (D, 3)"""
     normal: NDArray[np.float32]
@@ -38,6 +41,7 @@ class Screen(NamedTuple):
     color: NDArray[np.float32]
     color_level: NDArray[np.int64]
     depth: NDArray[np.float32]
+    farthest: NDArray[np.float32]
     depth_level: NDArray[np.int64]
     normal: NDArray[np.float32]
 
@@ -69,6 +73,7 @@ def new_screen_buffers(w: int, h: int, blurred: bool) -> ScreenBuffers:
     return ScreenBuffers(
         np.zeros((total(colors), 3), np.float32),
         colors,
+        np.zeros(total(depths), np.float32),
         np.zeros(total(depths), np.float32),
         depths,
         np.zeros((h, w, 3), np.float32),
@@ -118,8 +123,8 @@ def blur_level(color, levels, level):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def nearest_levels(depth, levels):  # type: ignore[no-untyped-def]
-    """Fill every level of the depth pyramid from level 0."""
+def fill_depth_levels(depth, farthest, levels):  # type: ignore[no-untyped-def]
+    """Fill every level above 0 of the two depth pyramids from level 0 of `depth`."""
     for level in range(1, levels.shape[0]):
         first, w, h = levels[level - 1]
         target, tw, th = levels[level]
@@ -127,9 +132,19 @@ def nearest_levels(depth, levels):  # type: ignore[no-untyped-def]
             ya, yb = first + 2 * y * w, first + min(2 * y + 1, h - 1) * w
             for x in range(tw):
                 xa, xb = 2 * x, min(2 * x + 1, w - 1)
-                a = min(depth[ya + xa], depth[ya + xb])
-                b = min(depth[yb + xa], depth[yb + xb])
-                depth[target + y * tw + x] = min(a, b)
+                i = target + y * tw + x
+                depth[i] = min(min(depth[ya + xa], depth[ya + xb]), min(depth[yb + xa], depth[yb + xb]))
+                far = farthest
+                if level == 1:
+                    far = depth
+                a, b = _seen(far[ya + xa]), _seen(far[ya + xb])
+                c, d = _seen(far[yb + xa]), _seen(far[yb + xb])
+                farthest[i] = max(max(a, b), max(c, d))
+
+
+@inlined
+def _seen(z):  # type: ignore[no-untyped-def]
+    return z if z < np.inf else np.float32(0.0)
 
 
 @inlined

@@ -99,7 +99,7 @@ def refract_tile(world, screen, probes, thing_probe, choices, scratch, tile, sam
                 if channels > 1:
                     _reload(block, exits, layer, world, view, choices, x0, y0)
                 _set_iors(exits, world, layer, x0, y0, ior, channel if channels > 1 else 1)
-                find_exits(exits, block, parts, packet, world, ior)
+                find_exits(exits, block, parts, packet, world, ior, not choices.hdrp)
                 _query_exits(query, exits, block, parts, world)
                 ask(query, choices.tiers, choices.hdrp, screen, probes, thing_probe, z_self, block, second, third,
                     packet, world, sample)  # fmt: skip

@@ -23,10 +23,10 @@ from .kernel import is_compiled
 from .lights import pack_lights
 from .planes import Planes, add_tile, by_name, finish_of, finish_tile, new_planes
 from .pointer import Pointer
-from .pyramid import Screen, ScreenBuffers, blur_level, nearest_levels, new_screen_buffers
+from .pyramid import Screen, ScreenBuffers, blur_level, fill_depth_levels, new_screen_buffers
 from .refraction import Choices, LayerResult, new_layer_result, put_tile, refract_tile
 from .sampling import pixel_offset
-from .scene import Camera, Model, Param, Scene
+from .scene import Camera, Model, Notice, Param, Scene
 from .scratch import scratch
 from .settings import TIERS, RenderSettings
 from .tables import pack_geometry, pack_materials
@@ -123,7 +123,14 @@ def render(
         "refract:metersPerUnit": scene.metres_per_unit,
         "refract:rays": float(rays + session.rays),
     }
-    return Frame(width, height, planes, metadata, scene.notices)
+    return Frame(width, height, planes, metadata, scene.notices + open_meshes(scene, settings.model))
+
+
+def open_meshes(scene: Scene, model: str) -> tuple[Notice, ...]:
+    """Say which meshes were to be traced but have no inside to trace through."""
+    text = "the mesh is open, so 'traced' finds no far side; drawn as 'thin'. Close the mesh, or set another model"
+    traced = np.array([m.refractive and (m.model is Model.TRACED or model == "traced") for m in scene.materials], bool)
+    return tuple(Notice(m.path, text) for m in scene.meshes if not m.closed and traced[m.materials].any())
 
 
 def choose_camera(scene: Scene, name: str) -> Camera:
@@ -270,7 +277,7 @@ def _composite_layer(
     if TIERS.index("screen") in choices.tiers:
         blurs = range(1, len(screen.color_level))
         jobs: list[Callable[[], Any]] = [
-            lambda: nearest_levels(screen.depth, screen.depth_level),
+            lambda: fill_depth_levels(screen.depth, screen.farthest, screen.depth_level),
             lambda: [blur_level(screen.color, screen.color_level, i) for i in blurs],
         ]
         work.run(lambda job: job(), jobs)

@@ -18,6 +18,7 @@ SCREEN_FADE = 0.1
 """Screen Weight Distance (HDRP's default)."""
 _MAX_STEPS = 384
 _FACING = 1e-3  # cosine below which a surface is seen too edge-on to be hit
+_BEHIND = 1.02  # ratio of depths beyond which a ray is behind a surface, however steep it is within its pixel
 _SLACK = 1.0  # how far outside its pixel a plane may be met, in pixels' worth of the ray
 
 
@@ -84,10 +85,14 @@ def march(screen, origin, direction):  # type: ignore[no-untyped-def]
         tx = tx if tx > t else (t if tx > t - 1e-9 else math.inf)
         ty = ty if ty > t else (t if ty > t - 1e-9 else math.inf)
         out = min(tx, ty, end)
-        deepest = max(z + t * dz, z + out * dz) if out < math.inf else (math.inf if dz > 0.0 else z + t * dz)
-        first, w = screen.depth_level[level, 0], screen.depth_level[level, 1]
-        nearest = screen.depth[first + cy * w + cx]
-        if deepest >= nearest:
+        entry = z + t * dz
+        leave = z + out * dz if out < math.inf else (math.inf if dz > 0.0 else entry)
+        i = screen.depth_level[level, 0] + cy * screen.depth_level[level, 1] + cx
+        nearest = screen.depth[i]
+        # In front of everything in the cell, or behind all of it: nothing here can be hit.
+        clear_of = max(entry, leave) < nearest
+        clear_of = clear_of or (level > 0 and min(entry, leave) > screen.farthest[i] * _BEHIND)
+        if not clear_of:
             if level > 0:
                 level -= 1
                 continue
@@ -106,7 +111,7 @@ def march(screen, origin, direction):  # type: ignore[no-untyped-def]
         else:
             iy = edge_y if step_y > 0 else edge_y - 1
             ix = _other(ax + t * bx, aw + t * bw, cx, level)
-        if deepest < nearest and level < last:
+        if clear_of and level < last:
             level += 1
     return False, 0.0, 0.0, 0.0
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .bsdf import MIRROR_ALPHA, directional_albedo, sample_half_vector
+from .bsdf import MIRROR_ALPHA, sample_half_vector, specular_albedo
 from .embree import GEOM, HIT_U, HIT_V, LANES, PRIM, SCATTERED, T_FAR, clear, set_ray
 from .environment import irradiance, prefiltered, sample_direction
 from .kernel import inlined
@@ -24,8 +24,10 @@ from .tracing import add_shadow_ray, intersect_world, off_surface, visible
 from .vec import add, dot, flip_towards, frame, lerp, mul, normalize, row, scale, sub
 
 _REFLECTED_ROUGHNESS = 0.5
-"""Rougher surfaces take their reflection from the environment map alone."""
-_SKY_CANDIDATES = 4
+_POLISHED_ROUGHNESS = 0.2
+"""Mirrors up to the first roughness, and dielectrics up to the second, reflect the scene by a ray of their own; others
+take their reflection from the environment map alone."""
+_SKY_CANDIDATES = 2
 # Purposes of the sampling sequence; lights use 16 + their number.
 _SKY, _MIRROR = 1, 2
 
@@ -115,13 +117,18 @@ def load_surface(block, lane, hit, world, wo):  # type: ignore[no-untyped-def]
         dielectric = ((ior - 1.0) / (ior + 1.0)) ** 2
         f0 = lerp((dielectric, dielectric, dielectric), base, metallic)
     roughness = min(1.0, max(0.0, float_input(g, mt, tx, hit, m, Param.ROUGHNESS.value)))
-    fresnel = _fresnel(f0, roughness, abs(dot(ns, wo)))
-    kept = (1.0 - metallic) * (1.0 - max(fresnel[0], fresnel[1], fresnel[2]))
+    sent_back = specular_albedo(f0, roughness, abs(dot(ns, wo)))
+    kept = scale(base, 1.0 - metallic)
+    diffuse = (
+        kept[0] * (1.0 - min(1.0, sent_back[0])),
+        kept[1] * (1.0 - min(1.0, sent_back[1])),
+        kept[2] * (1.0 - min(1.0, sent_back[2])),
+    )
     put(block.point, lane, hit.point)
     put(block.ng, lane, ng)
     put(block.ns, lane, ns)
     put(block.wo, lane, wo)
-    put(block.albedo, lane, scale(base, kept))
+    put(block.albedo, lane, diffuse)
     put(block.f0, lane, f0)
     put(block.emissive, lane, color_input(g, mt, tx, hit, m, Param.EMISSIVE.value))
     block.roughness[lane] = roughness
@@ -132,9 +139,9 @@ def load_surface(block, lane, hit, world, wo):  # type: ignore[no-untyped-def]
 
 @inlined
 def _fresnel(f0, roughness, cosine):  # type: ignore[no-untyped-def]
-    """Schlick with its grazing value lowered for rough surfaces (Lagarde 2011)."""
+    """Schlick with its grazing value lowered for rough surfaces (Lagarde 2011) and for those that hardly reflect."""
     x = (1.0 - min(1.0, cosine)) ** 5
-    top = 1.0 - roughness
+    top = (1.0 - roughness) * min(1.0, 50.0 * max(f0[0], f0[1], f0[2]))
     return (
         f0[0] + (max(top, f0[0]) - f0[0]) * x,
         f0[1] + (max(top, f0[1]) - f0[1]) * x,
@@ -270,10 +277,8 @@ def _environment_gloss(block, lane, world, f0, roughness, weight):  # type: igno
     n, wo = row(block.ns, lane), row(block.wo, lane)
     cosine = min(1.0, max(1e-3, dot(n, wo)))
     r = sub(scale(n, 2.0 * dot(n, wo)), wo)
-    a, b = directional_albedo(cosine, roughness)
     light = scale(prefiltered(world.environment, r, roughness), weight * block.scratch[3, lane])
-    reflectance = (f0[0] * a + b, f0[1] * a + b, f0[2] * a + b)
-    put(block.color, lane, add(row(block.color, lane), mul(light, reflectance)))
+    put(block.color, lane, add(row(block.color, lane), mul(light, specular_albedo(f0, roughness, cosine))))
 
 
 @inlined
@@ -290,7 +295,8 @@ def shade(block, second, packet, world, sample, mask):  # type: ignore[no-untype
             continue
         f0, roughness = row(block.f0, lane), block.roughness[lane]
         strength = max(f0[0], f0[1], f0[2])
-        if roughness < _REFLECTED_ROUGHNESS and strength > 0.02:
+        limit = _REFLECTED_ROUGHNESS if strength > 0.2 else _POLISHED_ROUGHNESS
+        if roughness < limit and strength > 0.02:
             bounces = True
             _add_mirror_ray(block, lane, packet, sample, mask)
         else:
@@ -314,15 +320,14 @@ def shade(block, second, packet, world, sample, mask):  # type: ignore[no-untype
         if block.scratch[1, lane] == 0.0:
             continue
         if second.on[lane] != 0:
+            _environment_gloss(second, lane, world, row(second.f0, lane), second.roughness[lane], 1.0)
             light = row(second.color, lane)
         elif world.environment.present:
             light = prefiltered(world.environment, row(block.specular, lane), 0.0)
         else:
             continue
         cosine = min(1.0, max(1e-3, dot(row(block.ns, lane), row(block.wo, lane))))
-        a, b = directional_albedo(cosine, block.roughness[lane])
-        f0 = row(block.f0, lane)
-        reflectance = (f0[0] * a + b, f0[1] * a + b, f0[2] * a + b)
+        reflectance = specular_albedo(row(block.f0, lane), block.roughness[lane], cosine)
         put(block.color, lane, add(row(block.color, lane), mul(light, reflectance)))
 
 

@@ -21,7 +21,7 @@ ROOMS = {
     "pxr": ("refract_core.usd", "schemas"),
     "embreex": ("refract_core.embree",),
     "ctypes": ("refract_core.embree", "service"),
-    "llvmlite": ("refract_core.embree", "refract_core.kernel"),
+    "llvmlite": ("refract_core.embree", "refract_core.kernel", "refract_core.pointer"),
     "OpenImageIO": ("refract_core.image",),
     "fastapi": ("service",),
     "starlette": ("service",),

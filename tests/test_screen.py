@@ -19,7 +19,7 @@ from refract_core.pyramid import (
     blur_level,
     color_levels,
     depth_levels,
-    nearest_levels,
+    fill_depth_levels,
     new_screen_buffers,
 )
 from refract_core.scene import Camera
@@ -66,7 +66,7 @@ def picture_of(planes: list[tuple[ArrayLike, ArrayLike, float]], lens: Camera = 
         depth[seen] = z[seen]
         screen.normal[seen] = np.where((d[seen] @ n)[:, None] < 0, n, -n)
     screen.depth[: WIDTH * HEIGHT] = depth.ravel()
-    nearest_levels(screen.depth, screen.depth_level)
+    fill_depth_levels(screen.depth, screen.farthest, screen.depth_level)
     return Screen(view_of(lens, WIDTH, HEIGHT), *screen)
 
 
@@ -158,7 +158,8 @@ def test_every_depth_cell_is_the_nearest_pixel_under_it(width: int, height: int,
     base = np.random.default_rng(seed).uniform(1, 9, (height, width)).astype(np.float32)
     base[0, 0] = np.inf
     depth[: width * height] = base.ravel()
-    nearest_levels(depth, levels)
+    farthest = np.zeros_like(depth)
+    fill_depth_levels(depth, farthest, levels)
     assert levels[-1, 1:].tolist() == [1, 1]
     for k, (first, w, h) in enumerate(levels):
         level = depth[first : first + w * h].reshape(h, w)
@@ -167,6 +168,8 @@ def test_every_depth_cell_is_the_nearest_pixel_under_it(width: int, height: int,
                 cell = base[y << k : (y + 1) << k, x << k : (x + 1) << k]
                 assert cell.size
                 assert level[y, x] == cell.min()
+                if k > 0:
+                    assert farthest[first + y * w + x] == np.where(np.isfinite(cell), cell, 0).max()
 
 
 def test_blurring_keeps_a_constant_and_spreads_a_spot() -> None:

@@ -311,6 +311,14 @@ def test_a_full_binding_wins_and_a_stronger_ancestor_wins_over_both() -> None:
     assert name_of(scene, scene.meshes[0], 0) == "/A"
 
 
+def test_a_preview_binding_serves_where_nothing_else_is_bound() -> None:
+    scene = read(
+        material("A") + material("B") + TWO_TRIANGLES("rel material:binding:preview = </A>", name="M")
+        + TWO_TRIANGLES("rel material:binding:preview = </A>\nrel material:binding = </B>", name="N")
+    )  # fmt: skip
+    assert [name_of(scene, mesh, 0) for mesh in scene.meshes] == ["/A", "/B"]
+
+
 def test_a_binding_to_nothing_is_named_and_display_color_used() -> None:
     scene = read(TWO_TRIANGLES("rel material:binding = </Nowhere>"))
     assert "/Nowhere does not exist" in texts(scene, "/M")

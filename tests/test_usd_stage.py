@@ -308,6 +308,11 @@ def test_skinned_points_are_those_usdskel_computes(assets: Path, time: float) ->
     (mesh,) = scene.meshes
     assert to_stage(scene, mesh.points) == pytest.approx(expected, abs=1e-5)
     assert not mesh.static
+    assert mesh.normals is not None
+    corners = mesh.points[mesh.triangles]
+    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    facing /= np.linalg.norm(facing, axis=1, keepdims=True)
+    assert (facing[:, None] * mesh.normals).sum(axis=2).mean() > 0.95, "normals bend with the skin"
 
 
 # --- lights ---------------------------------------------------------------------------------------------------------

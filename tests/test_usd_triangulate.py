@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scene_reading import areas, solid
 
-from refract_core.usd.triangulate import is_closed, smooth_normals, triangulate, weld
+from refract_core.usd.triangulate import fans, fans_fit, is_closed, smooth_normals, triangulate, weld
 
 Points = NDArray[np.float32]
 
@@ -95,6 +95,27 @@ def closed(points: list[tuple[int, int, int]], faces: list[list[int]]) -> bool:
     counts = np.array([len(face) for face in faces])
     flat = np.array([index for face in faces for index in face])
     return is_closed(np.array(points, np.float32), flat, np.cumsum(counts) - counts, counts)
+
+
+@pytest.mark.parametrize(("inward", "convex"), [(0.0, True), (0.4, True), (0.5, False), (0.6, False)])
+def test_the_short_way_for_small_meshes_is_taken_only_where_it_cuts_as_the_long_way(
+    inward: float, convex: bool
+) -> None:
+    """A triangle and a unit square whose last corner moves along the diagonal: past the middle its fan is no more."""
+    points = np.array([(1, 0), (1, 1), (0, 1), (inward, inward), (3, 0), (4, 0), (3, 1)], np.float32)
+    points = np.pad(points, ((0, 0), (0, 1)))
+    indices, counts = np.array([4, 5, 6, 0, 1, 2, 3]), np.array([3, 4])
+    starts = np.cumsum(counts) - counts
+    long = triangulate(points, indices, starts, counts, np.arange(2))
+    short, loops = fans(starts, counts)
+    assert fans_fit(points, indices, loops) == convex
+    assert np.array_equal(long.corners, short.corners) == convex
+
+
+def test_a_triangle_without_area_is_not_taken_the_short_way() -> None:
+    points = np.array([(0, 0, 0), (1, 1, 1), (2, 2, 2)], np.float32)
+    _, loops = fans(np.array([0]), np.array([3]))
+    assert not fans_fit(points, np.arange(3), loops)
 
 
 def test_a_cube_is_closed_until_a_face_is_missing_turned_or_doubled() -> None:

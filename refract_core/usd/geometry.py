@@ -19,6 +19,7 @@ SUBDIVIDED = (UsdGeom.Tokens.catmullClark, UsdGeom.Tokens.loop)
 _MESH_ATTRIBUTES = ("points", "faceVertexCounts", "faceVertexIndices", "holeIndices", "normals")
 _LARGEST = 1.0e15
 """Coordinates beyond it are taken for garbage: their squares still fit float32."""
+_IDENTITY = np.eye(4)
 _SMALL = 512
 """Face corners up to which a topology is kept: many small meshes are the same few shapes."""
 
@@ -37,7 +38,7 @@ class Shape:
     """None on gprims, where only constant primvars are defined."""
     natural: dict[str, Corners] = field(default_factory=dict)
     """Primvars a gprim has by its nature, used where the stage authors none of that name."""
-    prim_from_shape: F64 = field(default_factory=lambda: np.eye(4))
+    prim_from_shape: F64 = field(default_factory=lambda: _IDENTITY)
     """shape (4, 4), column vectors"""
     closed: bool = False
     double_sided: bool = False
@@ -61,7 +62,8 @@ def read_shape(prim: Usd.Prim, time: Usd.TimeCode, notices: list[Notice]) -> Sha
 
 
 def _varies(prim: Usd.Prim, names: tuple[str, ...]) -> bool:
-    return any(prim.GetAttribute(name).ValueMightBeTimeVarying() for name in names)
+    authored = prim.GetAuthoredPropertyNames()
+    return any(name in authored and prim.GetAttribute(name).ValueMightBeTimeVarying() for name in names)
 
 
 def _read_gprim(prim: Usd.Prim, time: Usd.TimeCode) -> Shape:
@@ -276,7 +278,8 @@ def _authored_normals(
 ) -> Corners | None:
     """`primvars:normals`, else `normals`."""
     path = str(mesh.GetPath())
-    primvar = UsdGeom.PrimvarsAPI(mesh.GetPrim()).GetPrimvar("normals")
+    attribute = mesh.GetPrim().GetAttribute("primvars:normals")
+    primvar = UsdGeom.Primvar(attribute) if attribute else None
     try:
         if primvar and primvar.HasValue():
             normals = evaluate(primvar, time, topology)

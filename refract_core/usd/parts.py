@@ -13,6 +13,7 @@ from ..scene import F32, I32, Material, Notice, Texture
 from .geometry import Shape
 from .materials import display_color_material, read_material
 from .primvars import as_values, read_primvar, spread
+from .traverse import some_of
 
 
 @dataclass
@@ -64,13 +65,15 @@ def bind(prims: Sequence[Usd.Prim], notices: list[Notice]) -> list[Bound]:
         )
         for place, preview in zip(missing, previews, strict=True):
             found[place] = preview
-    materials = []
-    for prim, material, relationship in zip(asked, found, said, strict=True):
-        materials.append(material if material else None)
-        if not material and relationship:
+    materials = [material if material else None for material in found]
+    broken: dict[str, list[str]] = {}
+    for prim, material, relationship in zip(asked, materials, said, strict=True):
+        if material is None and relationship:
             targets = ", ".join(map(str, relationship.GetTargets())) or "nothing"
-            text = f"the bound material {targets} does not exist or is no Material; displayColor is used"
-            notices.append(Notice(str(prim.GetPath()), text))
+            broken.setdefault(targets, []).append(str(prim.GetPath()))
+    for targets, paths in broken.items():
+        text = f"the bound material {targets} does not exist or is no Material; displayColor is used"
+        notices.append(Notice(paths[0], f"{text} ({some_of(paths)})" if len(paths) > 1 else text))
     rest = iter(materials[len(prims) :])
     return [
         Bound(material, tuple((subset, next(rest)) for subset in group))

@@ -20,6 +20,7 @@ def posed(stage: Usd.Stage, time: Usd.TimeCode, notices: list[Notice]) -> Usd.St
         path = str(root.GetPath())
         if moving:
             UsdGeom.PrimvarsAPI(root).CreatePrimvar("refract:static", Sdf.ValueTypeNames.Int).Set(0)
+        _move_normals(root, time)
         try:
             baked = UsdSkel.BakeSkinning(UsdSkel.Root(root), Gf.Interval(time.GetValue(), time.GetValue()))
         except Tf.ErrorException:
@@ -57,6 +58,18 @@ def _hold(stage: Usd.Stage, time: Usd.TimeCode) -> bool:
                 moving = moving or attribute.ValueMightBeTimeVarying()
                 attribute.Set(value, time)
     return moving
+
+
+def _move_normals(root: Usd.Prim, time: Usd.TimeCode) -> None:
+    """Makes `primvars:normals` the attribute `normals`: baking turns only the latter, and the former would win."""
+    for prim in Usd.PrimRange(root):
+        primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("normals")
+        if not (prim.IsA(UsdGeom.PointBased) and primvar and primvar.HasValue()):
+            continue
+        normals, interpolation = primvar.ComputeFlattened(time), primvar.GetInterpolation()
+        primvar.GetAttr().Block()
+        UsdGeom.PointBased(prim).GetNormalsAttr().Set(normals)  # without a time: baking overlooks a first sample
+        UsdGeom.PointBased(prim).SetNormalsInterpolation(interpolation)
 
 
 def _of_type(stage: Usd.Stage, kind: type) -> list[Usd.Prim]:
