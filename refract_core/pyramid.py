@@ -27,7 +27,8 @@ class ScreenBuffers(NamedTuple):
     depth: NDArray[np.float32]
     """shape (N,): nearest of each cell; level 0 is the depth itself"""
     farthest: NDArray[np.float32]
-    """shape (N,): farthest of each cell, background left out (0 where there is nothing else); level 0 is not used"""
+    """shape (N,): farthest of each cell and the pixels next to it, background left out (0 where there is nothing else);
+    level 0 is not used"""
     depth_level: NDArray[np.int64]
     """shape (D, 3)"""
     normal: NDArray[np.float32]
@@ -134,17 +135,24 @@ def fill_depth_levels(depth, farthest, levels):  # type: ignore[no-untyped-def]
                 xa, xb = 2 * x, min(2 * x + 1, w - 1)
                 i = target + y * tw + x
                 depth[i] = min(min(depth[ya + xa], depth[ya + xb]), min(depth[yb + xa], depth[yb + xb]))
-                far = farthest
                 if level == 1:
-                    far = depth
-                a, b = _seen(far[ya + xa]), _seen(far[ya + xb])
-                c, d = _seen(far[yb + xa]), _seen(far[yb + xb])
-                farthest[i] = max(max(a, b), max(c, d))
+                    farthest[i] = _farthest_around(depth, w, h, 2 * x, 2 * y)
+                    continue
+                a, b = farthest[ya + xa], farthest[ya + xb]
+                farthest[i] = max(max(a, b), max(farthest[yb + xa], farthest[yb + xb]))
 
 
 @inlined
-def _seen(z):  # type: ignore[no-untyped-def]
-    return z if z < np.inf else np.float32(0.0)
+def _farthest_around(depth, w, h, x, y):  # type: ignore[no-untyped-def]
+    """Farthest of the 2x2 pixels from (x, y) and the ring around them, background left out: a surface inside a pixel
+    may lie deeper than at its centre, but not deeper than at its neighbour's."""
+    found = np.float32(0.0)
+    for j in range(max(0, y - 1), min(h, y + 3)):
+        for i in range(max(0, x - 1), min(w, x + 3)):
+            z = depth[j * w + i]
+            if z < np.inf:
+                found = max(found, z)
+    return found
 
 
 @inlined

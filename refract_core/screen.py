@@ -18,7 +18,7 @@ SCREEN_FADE = 0.1
 """Screen Weight Distance (HDRP's default)."""
 _MAX_STEPS = 384
 _FACING = 1e-3  # cosine below which a surface is seen too edge-on to be hit
-_BEHIND = 1.02  # ratio of depths beyond which a ray is behind a surface, however steep it is within its pixel
+_BEHIND = 1.001  # ratio of depths beyond which a ray counts as behind a surface
 _SLACK = 1.0  # how far outside its pixel a plane may be met, in pixels' worth of the ray
 
 

@@ -46,7 +46,7 @@ WARNINGS = {
     "no_faces_left": Said("/World/Quad", ("skipped", "none of its 2 faces")),
     "no_unit": Said("", ("metersPerUnit is 0", "above 0")),
     "nothing_visible": Said("/", ("nothing is visible", "empty")),
-    "thickness_zero": Said(MATERIAL, ("thickness", "0.0", "clamped")),
+    "thickness_zero": Said(MATERIAL, ("inputs:refraction:thickness", "is 0;", "clamped")),
     "transmittance_above_one": Said(MATERIAL, ("transmittanceColor", "1.5", "0 to 1")),
     "unknown_shader": Said(MATERIAL, ("NoSuchShader", "UsdPreviewSurface")),
     "unknown_up_axis": Said("", ("upAxis", "'X'", "Y or Z")),

@@ -162,7 +162,8 @@ def _emission(context: Context, light: UsdLux.LightAPI) -> tuple[float, float, f
     with np.errstate(over="ignore", invalid="ignore"):
         emission = color * intensity * np.exp2(exposure) * _temperature(context, prim)
     if not np.isfinite(emission).all() or (emission < 0.0).any() or float(emission.max()) > 1e30:
-        _note(context, prim, f"intensity {intensity}, exposure {exposure}, color {tuple(color)} is no finite positive "
+        shown = tuple(color.tolist())
+        _note(context, prim, f"intensity {intensity}, exposure {exposure}, color {shown} is no finite positive "
                              "emission; the light is skipped; author values of at least 0")  # fmt: skip
         return None
     return (float(emission[0]), float(emission[1]), float(emission[2]))

@@ -231,7 +231,8 @@ def _thickness(context: Context, material: UsdShade.Material, model: Model, unit
     source = read_source(context, port, 1.0)
     if not is_constant(source):
         return scaled(source, unit * multiplier)
-    metres = clamped(context, Param.THICKNESS, scaled(source, unit * multiplier), "refraction thickness [m]")
+    label = "inputs:refraction:thickness in metres"
+    metres = clamped(context, Param.THICKNESS, scaled(source, unit * multiplier), label)
     if producer(context, port) is not None and UsdShade.Output.IsOutput(producer(context, port)):
         return constant(metres.value[0])
     return replace(_thickness_of(source, unit * multiplier), value=metres.value)

@@ -87,7 +87,7 @@ def clamped(context: Context, param: Param, source: Source, label: str) -> Sourc
     if not is_constant(source) or all(low <= value <= high for value in values):
         return source
     kept = tuple(min(max(value, low), high) for value in values)
-    shown = values if isinstance(DEFAULTS[param], tuple) else values[0]
+    shown = "(" + ", ".join(f"{v:g}" for v in values) + ")" if isinstance(DEFAULTS[param], tuple) else f"{values[0]:g}"
     above = f"{low:g} to {high:g}" if math.isfinite(high) else f"at least {low:g}"
     note(context, f"{label} is {shown}; the valid range is {above}; it is clamped")
     alpha = source.value[3] if isinstance(DEFAULTS[param], tuple) else kept[0]
