@@ -126,23 +126,23 @@ def _polygon_irradiance(p, n, centre, x, y, sides):  # type: ignore[no-untyped-d
     total = 0.0
     leaving = entering = c
     cut = False
-    a = _corner(c, x, y, 0, sides)
+    a = normalize(_corner(c, x, y, 0, sides))
     for k in range(sides):
-        b = _corner(c, x, y, k + 1, sides)
+        b = normalize(_corner(c, x, y, k + 1, sides))
         ha, hb = dot(a, n), dot(b, n)
         start, end = a, b
         if (ha > 0.0) != (hb > 0.0):
-            crossing = lerp(a, b, ha / (ha - hb))
+            crossing = normalize(lerp(a, b, ha / (ha - hb)))
             cut = True
             if ha > 0.0:
                 end = leaving = crossing
             else:
                 start = entering = crossing
         if ha > 0.0 or hb > 0.0:
-            total += _polygon_edge(normalize(start), normalize(end), n)
+            total += _polygon_edge(start, end, n)
         a = b
     if cut:
-        total += _polygon_edge(normalize(leaving), normalize(entering), n)
+        total += _polygon_edge(leaving, entering, n)
     return abs(total) * 0.5
 
 

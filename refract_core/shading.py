@@ -214,8 +214,7 @@ def _gather_sky(block, packet, world, sample, mask):  # type: ignore[no-untyped-
             continue
         x, y = block.pixel[lane, 0], block.pixel[lane, 1]
         n = row(block.ns, lane)
-        a, b = unit_pair(x, y, sample, _SKY)
-        direction = _cosine_direction(n, a, b)
+        direction = n
         total = 0.0
         pick = unit_pair(x, y, sample, _SKY + 4)[0]
         for k in range(_SKY_CANDIDATES):
@@ -230,6 +229,9 @@ def _gather_sky(block, packet, world, sample, mask):  # type: ignore[no-untyped-
                     pick /= chance
                 else:
                     pick = (pick - chance) / max(1.0 - chance, 1e-9)
+        if total == 0.0:  # all candidates were below the horizon
+            a, b = unit_pair(x, y, sample, _SKY)
+            direction = _cosine_direction(n, a, b)
         add_shadow_ray(packet, lane, row(block.point, lane), row(block.ng, lane), direction, math.inf)
     visible(packet, world, mask, seen)
     for lane in range(LANES):
