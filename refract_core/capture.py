@@ -17,6 +17,7 @@ from .pointer import Pointer
 from .probes import TEXEL, ProbeTable, capture_rows, empty_table, face_direction, fill_levels, in_order
 from .scene import Camera, Probe, Scene, Texture, Volume
 from .scratch import scratch
+from .srgb import srgb_decode
 from .tables import prim_of
 
 _MAX_OWN = 8
@@ -183,8 +184,7 @@ def _resample(table: ProbeTable, k: int, texture: Texture) -> None:
     if texture.pixels.dtype == np.uint8:
         pixels = pixels / 255.0
         if texture.srgb:
-            c = pixels[..., :3]
-            pixels[..., :3] = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+            pixels[..., :3] = srgb_decode(pixels[..., :3])
     h, w = pixels.shape[:2]
     res = int(table.resolution[k])
     stride = res + 2

@@ -16,6 +16,7 @@ from .embree import COHERENT, GEOM, HIT_U, HIT_V, LANES, OPAQUE, PRIM, REFRACTIV
 from .kernel import inlined
 from .optics_scalar import THIN_THICKNESS, box_model, reflect, refract, sphere_model, thin_model, transmittance
 from .scene import Model, Param
+from .shading import put
 from .surface import color_input, float_input, hit_at, material_of, normal_input
 from .tracing import intersect_world, off_surface
 from .vec import along, dot, flip_towards, mul, normalize, row, scale, sub
@@ -71,13 +72,6 @@ def new_exits() -> Exits:
 
 
 @inlined
-def _put(a, lane, v):  # type: ignore[no-untyped-def]
-    a[lane, 0] = v[0]
-    a[lane, 1] = v[1]
-    a[lane, 2] = v[2]
-
-
-@inlined
 def load_medium(exits, lane, hit, world, override):  # type: ignore[no-untyped-def]
     """Look up the refraction attributes at an entry. `override`: a `Model` for every material, or -1."""
     g, mt, tx = world.geometry, world.materials, world.textures
@@ -94,7 +88,7 @@ def load_medium(exits, lane, hit, world, override):  # type: ignore[no-untyped-d
     exits.ior[lane] = max(1.0, float_input(g, mt, tx, hit, m, Param.IOR.value))
     exits.thickness[lane] = thickness
     exits.absorption_distance[lane] = distance
-    _put(exits.color, lane, color_input(g, mt, tx, hit, m, Param.TRANSMITTANCE.value))
+    put(exits.color, lane, color_input(g, mt, tx, hit, m, Param.TRANSMITTANCE.value))
 
 
 @inlined
@@ -126,11 +120,11 @@ def find_exits(exits, block, hits, packet, world, ior, measured):  # type: ignor
             length, point, direction = thin_model(p, n, wo, ior[lane])
         else:
             length, point, direction = 0.0, p, scale(wo, -1.0)
-        _put(exits.point, lane, point)
-        _put(exits.direction, lane, direction)
+        put(exits.point, lane, point)
+        put(exits.direction, lane, direction)
         exits.path_length[lane] = length
         t = transmittance(row(exits.color, lane), exits.absorption_distance[lane], length)
-        _put(exits.transmittance, lane, t)
+        put(exits.transmittance, lane, t)
     if measured:
         _stop_at_opaque(exits, block, packet, world)
     if walks:
@@ -155,10 +149,10 @@ def _stop_at_opaque(exits, block, packet, world):  # type: ignore[no-untyped-def
         t = float(packet.rays[T_FAR, lane])
         rays = packet.rays
         exits.status[lane] = EMBEDDED
-        _put(exits.point, lane, (float(rays[0, lane]), float(rays[1, lane]), float(rays[2, lane])))
-        _put(exits.direction, lane, (float(rays[4, lane]), float(rays[5, lane]), float(rays[6, lane])))
+        put(exits.point, lane, (float(rays[0, lane]), float(rays[1, lane]), float(rays[2, lane])))
+        put(exits.direction, lane, (float(rays[4, lane]), float(rays[5, lane]), float(rays[6, lane])))
         exits.path_length[lane] = t
-        _put(exits.transmittance, lane, transmittance(row(exits.color, lane), exits.absorption_distance[lane], t))
+        put(exits.transmittance, lane, transmittance(row(exits.color, lane), exits.absorption_distance[lane], t))
 
 
 @inlined
@@ -167,10 +161,10 @@ def _start_walk(exits, lane, block, part, p, n, wo, ior):  # type: ignore[no-unt
     ng = row(block.ng, lane)
     if dot(inside, ng) >= 0.0:  # a steep shading normal must not send the ray back out
         _, inside = refract(scale(wo, -1.0), ng, 1.0 / ior)
-    _put(exits.point, lane, off_surface(p, ng, inside))
-    _put(exits.direction, lane, inside)
+    put(exits.point, lane, off_surface(p, ng, inside))
+    put(exits.direction, lane, inside)
     exits.path_length[lane] = 0.0
-    _put(exits.transmittance, lane, (1.0, 1.0, 1.0))
+    put(exits.transmittance, lane, (1.0, 1.0, 1.0))
     exits.inside[lane] = part
     exits.status[lane] = LOST
 
@@ -258,7 +252,7 @@ def _meet(exits, lane, world, ior):  # type: ignore[no-untyped-def]
     elif inside < 0 and not leaving and g.sheet[part] == 0 and mt.model[m] != Model.THIN.value:
         ior[lane] = max(1.0, float_input(g, mt, tx, hit, m, Param.IOR.value))
         exits.absorption_distance[lane] = mt.absorption_distance[m]
-        _put(exits.color, lane, color_input(g, mt, tx, hit, m, Param.TRANSMITTANCE.value))
+        put(exits.color, lane, color_input(g, mt, tx, hit, m, Param.TRANSMITTANCE.value))
         n = flip_towards(normal_input(g, mt, tx, hit, m), hit.ng)
         _, within = refract(d, n, 1.0 / ior[lane])
         if dot(within, hit.ng) >= 0.0:
@@ -272,7 +266,7 @@ def _meet(exits, lane, world, ior):  # type: ignore[no-untyped-def]
             cosine = max(1e-3, abs(dot(hit.ng, d)))
             tint = color_input(g, mt, tx, hit, m, Param.TRANSMITTANCE.value)
             through = transmittance(tint, THIN_THICKNESS, THIN_THICKNESS / cosine)
-            _put(exits.transmittance, lane, mul(row(exits.transmittance, lane), through))
+            put(exits.transmittance, lane, mul(row(exits.transmittance, lane), through))
         _go_on(exits, lane, hit, d)
 
 
@@ -280,10 +274,10 @@ def _meet(exits, lane, world, ior):  # type: ignore[no-untyped-def]
 def _absorb(exits, lane, length):  # type: ignore[no-untyped-def]
     exits.path_length[lane] += length
     through = transmittance(row(exits.color, lane), exits.absorption_distance[lane], length)
-    _put(exits.transmittance, lane, mul(row(exits.transmittance, lane), through))
+    put(exits.transmittance, lane, mul(row(exits.transmittance, lane), through))
 
 
 @inlined
 def _go_on(exits, lane, hit, direction):  # type: ignore[no-untyped-def]
-    _put(exits.point, lane, off_surface(hit.point, hit.ng, direction))
-    _put(exits.direction, lane, direction)
+    put(exits.point, lane, off_surface(hit.point, hit.ng, direction))
+    put(exits.direction, lane, direction)

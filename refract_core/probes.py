@@ -22,7 +22,7 @@ from .kernel import inlined, kernel
 from .scene import Probe
 from .shading import load_hits, shade
 from .tracing import intersect_world
-from .vec import along, length, normalize, row, scale, sub
+from .vec import along, length, normalize, row, scale, sub, transform_direction, transform_point
 from .volumes import INFINITE_DISTANCE, distance_fade, influence_box, influence_sphere, ray_box, ray_sphere
 
 TEXEL = 5
@@ -189,30 +189,12 @@ def cube_at(table, k, d, lod):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _to_volume(m, p):  # type: ignore[no-untyped-def]
-    return (
-        m[0, 0] * p[0] + m[0, 1] * p[1] + m[0, 2] * p[2] + m[0, 3],
-        m[1, 0] * p[0] + m[1, 1] * p[1] + m[1, 2] * p[2] + m[1, 3],
-        m[2, 0] * p[0] + m[2, 1] * p[1] + m[2, 2] * p[2] + m[2, 3],
-    )
-
-
-@inlined
-def _turn(m, d):  # type: ignore[no-untyped-def]
-    return (
-        m[0, 0] * d[0] + m[0, 1] * d[1] + m[0, 2] * d[2],
-        m[1, 0] * d[0] + m[1, 1] * d[1] + m[1, 2] * d[2],
-        m[2, 0] * d[0] + m[2, 1] * d[1] + m[2, 2] * d[2],
-    )
-
-
-@inlined
 def proxy_distance(table, k, p, d):  # type: ignore[no-untyped-def]
     """Distance from `p` along unit `d` to the proxy volume of probe `k`, at least 0 [m]."""
     if table.proxy_kind[k] == 2:
         return INFINITE_DISTANCE
     m = table.proxy[k]
-    o, v = _to_volume(m, p), _turn(m, d)
+    o, v = transform_point(m, p), transform_direction(m, d)
     e = row(table.proxy_extents, k)
     s = ray_sphere(o, v, e[0]) if table.proxy_kind[k] == 1 else ray_box(o, v, e)
     return max(s, 0.0)
@@ -222,14 +204,14 @@ def proxy_distance(table, k, p, d):  # type: ignore[no-untyped-def]
 def influence(table, k, p, n, d):  # type: ignore[no-untyped-def]
     """Weight 0 .. 1 of probe `k` at a point, for a ray along `d` from a surface with normal `n`."""
     m = table.influence[k]
-    q = _to_volume(m, p)
+    q = transform_point(m, p)
     from_capture = sub(p, row(table.capture, k))
     e = row(table.influence_extents, k)
     if table.influence_sphere[k] != 0:
         w = influence_sphere(q, n, from_capture, e[0], table.blend[k, 0], table.blend_normal[k, 0])
     else:
         w = influence_box(
-            q, n, _turn(m, d), from_capture, e, table.blend[k], table.blend_normal[k], table.face_fade[k]
+            q, n, transform_direction(m, d), from_capture, e, table.blend[k], table.blend_normal[k], table.face_fade[k]
         )
     return w * table.weight[k]
 
