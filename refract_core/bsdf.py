@@ -60,12 +60,6 @@ def smith_visibility(n_dot_v, n_dot_l, alpha):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def smith_g1(n_dot_x, alpha):  # type: ignore[no-untyped-def]
-    a2 = alpha * alpha
-    return 2.0 * n_dot_x / max(n_dot_x + math.sqrt(a2 + (1.0 - a2) * n_dot_x * n_dot_x), 1e-9)
-
-
-@inlined
 def sample_half_vector(n, wo, alpha, u1, u2):  # type: ignore[no-untyped-def]
     """A microfacet normal among those visible from `wo` (Heitz, JCGT 7(4) 2018)."""
     x, y = frame(n)

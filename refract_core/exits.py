@@ -199,10 +199,8 @@ def _note_interfaces(exits, packet, world):  # type: ignore[no-untyped-def]
         exits.met[lane, 0] = -1
         if packet.valid[lane] == 0:
             continue
-        t = float(packet.rays[T_FAR, lane])
-        exits.met[lane, 0], exits.met[lane, 1] = packet.words[GEOM, lane], packet.words[PRIM, lane]
-        exits.hit[lane, 0], exits.hit[lane, 1] = packet.rays[HIT_U, lane], packet.rays[HIT_V, lane]
-        exits.hit[lane, 2] = t
+        _keep_interface(exits, packet, lane)
+        t = exits.hit[lane, 2]
         packet.valid[lane] = 0
         if exits.met[lane, 0] >= 0 and exits.inside[lane] >= 0:
             p, d = row(exits.point, lane), row(exits.direction, lane)
@@ -213,9 +211,14 @@ def _note_interfaces(exits, packet, world):  # type: ignore[no-untyped-def]
     intersect_world(packet, world, exits.segment, SCATTERED)
     for lane in range(LANES):
         if packet.valid[lane] != 0 and packet.words[GEOM, lane] >= 0:
-            exits.met[lane, 0], exits.met[lane, 1] = packet.words[GEOM, lane], packet.words[PRIM, lane]
-            exits.hit[lane, 0], exits.hit[lane, 1] = packet.rays[HIT_U, lane], packet.rays[HIT_V, lane]
-            exits.hit[lane, 2] = packet.rays[T_FAR, lane]
+            _keep_interface(exits, packet, lane)
+
+
+@inlined
+def _keep_interface(exits, packet, lane):  # type: ignore[no-untyped-def]
+    exits.met[lane, 0], exits.met[lane, 1] = packet.words[GEOM, lane], packet.words[PRIM, lane]
+    exits.hit[lane, 0], exits.hit[lane, 1] = packet.rays[HIT_U, lane], packet.rays[HIT_V, lane]
+    exits.hit[lane, 2] = packet.rays[T_FAR, lane]
 
 
 @inlined

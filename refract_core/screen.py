@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from .camera import pixel_point, project
+from .camera import pixel_point, pixel_width, project
 from .kernel import inlined
 from .pyramid import color_at
 from .vec import along, dot, row, sub
@@ -171,10 +171,7 @@ def screen_march(screen, origin, direction, blur):  # type: ignore[no-untyped-de
     lod = 0.0
     if blur > 0.0:
         _, _, z = project(screen.camera, along(origin, direction, s))
-        pixel = (screen.camera.window[1] - screen.camera.window[0]) / screen.camera.size[0]
-        if not screen.camera.orthographic:
-            pixel *= max(z, 1e-6)
-        lod = math.log2(max(1.0, 2.0 * blur * s / pixel))
+        lod = math.log2(max(1.0, 2.0 * blur * s / pixel_width(screen.camera, max(z, 1e-6))))
     if lod > 0.0:
         return color_at(screen, px, py, lod), w, 1.0
     return _on_surface(screen, px, py, origin, direction, s), w, 1.0
