@@ -129,14 +129,14 @@ def test_arrows_point_down(package: str) -> None:
         for row in imports()
         if under(row.importer, package) and any(under(row.imported, room) for room in NEVER[package])
         # the command line may start the service
-        and row.importer != "refract_core.cli"
+        and not under(row.importer, "refract_core.cli")
     ]
     assert strays == []
 
 
 def test_nothing_in_the_engine_imports_the_command_line() -> None:
     importers = {row.importer for row in imports() if under(row.imported, "refract_core.cli")}
-    assert importers <= {"refract_core.__main__"}
+    assert [name for name in importers if not under(name, "refract_core.cli")] == []
 
 
 def test_no_import_cycles() -> None:

@@ -1,43 +1,14 @@
-"""The `refract` command: words to calls, no logic."""
+"""`refract render`."""
 
 from __future__ import annotations
 
-import os
-import signal
-import sys
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from types import FrameType
 from typing import Annotated
 
 import typer
 
-from .errors import RefractError, UsageError
-from .progress import Report, reporting
-from .sequence import Order, render_files
-from .version import __version__
+from ..sequence import Order, render_files
+from .app import Jobs, ProgressMode, app, outcome, words
 
-CANCELLED = 3
-
-app = typer.Typer(
-    help="Render USD stages with glass in them, without a GPU or a display.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,  # the boxes cut long option names off
-)
-
-
-def _print_version(wanted: bool) -> None:
-    if wanted:
-        typer.echo(f"refract {__version__}")
-        raise typer.Exit
-
-
-Version = Annotated[
-    bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
-]
 Stage = Annotated[str, typer.Argument(metavar="STAGE", help="The .usd, .usda, .usdc or .usdz file to render.")]
 Out = Annotated[
     str,
@@ -128,25 +99,8 @@ SettingsPrim = Annotated[
         help="RenderSettings prim to take settings from. Without it the one that the stage names; flags win over it.",
     ),
 ]
-Jobs = Annotated[int | None, typer.Option(help="Threads to use; 0, the default, means all cores.")]
 TileSize = Annotated[int | None, typer.Option(hidden=True)]
 SkipExisting = Annotated[bool, typer.Option("--skip-existing", help="Leave pictures that exist as they are.")]
-ProgressMode = Annotated[
-    str,
-    typer.Option(
-        "--progress",
-        metavar="auto|json|none",
-        help="How progress is told on stderr: auto is a bar on a terminal, json is one object per line.",
-    ),
-]
-
-
-@app.callback()
-def refract(version: Version = False) -> None:
-    """Render USD stages with glass in them, without a GPU or a display.
-
-    Exit codes: 0 done, 1 failed, 2 wrong usage, 3 cancelled.
-    """
 
 
 @app.command()
@@ -179,7 +133,7 @@ def render(
         "image_width": image_width,
         "image_height": image_height,
         "samples": samples,
-        "tiers": None if tiers is None else _list(tiers),
+        "tiers": None if tiers is None else words(tiers),
         "screen": screen,
         "model": model,
         "max_layers": max_layers,
@@ -194,75 +148,15 @@ def render(
         frames=frames,
         overrides={name: value for name, value in given.items() if value is not None},
         settings_prim=render_settings_prim_path,
-        aovs=_list(aovs),
+        aovs=words(aovs),
         color_correction=color_correction_mode,
         complexity=complexity,
         skip_existing=skip_existing,
     )
-    with _outcome(progress) as (report, cancel):
+    with outcome(progress) as (report, cancel):
         render_files(order, report, cancel)
-
-
-def _list(text: str) -> tuple[str, ...]:
-    return tuple(word.strip() for word in text.split(",") if word.strip())
 
 
 def _purposes(text: str) -> tuple[str, ...]:
     """usdrecord's rule: default is always drawn."""
-    return ("default", *(word for word in _list(text) if word != "default"))
-
-
-@contextmanager
-def _outcome(progress: str) -> Iterator[tuple[Report, Callable[[], bool]]]:
-    """Turn errors into a line on stderr and the exit code, and Ctrl-C into a wish to stop."""
-    try:
-        with reporting(progress) as report, _interrupts() as cancel:
-            try:
-                yield report, cancel
-            except RefractError as error:
-                report.error(str(error))
-                raise typer.Exit(error.exit_code) from error
-            except MemoryError as error:
-                report.error("out of memory; make the picture smaller, or the stage simpler")
-                raise typer.Exit(1) from error
-            except KeyboardInterrupt as error:
-                report.error("cancelled")
-                raise typer.Exit(CANCELLED) from error
-    except UsageError as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(error.exit_code) from error
-
-
-@contextmanager
-def _interrupts() -> Iterator[Callable[[], bool]]:
-    """The first Ctrl-C asks the work to stop at its next chance; a second one stops it where it is."""
-    if threading.current_thread() is not threading.main_thread():  # only the main thread may listen to signals
-        yield lambda: False
-        return
-    asked = threading.Event()
-
-    def on_interrupt(_signal: int, _frame: FrameType | None) -> None:
-        if asked.is_set():
-            raise KeyboardInterrupt
-        asked.set()
-
-    before = signal.signal(signal.SIGINT, on_interrupt)
-    try:
-        yield asked.is_set
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def main() -> None:
-    """Entry point of the `refract` command."""
-    try:
-        app(prog_name="refract")
-    except SystemExit as end:
-        if end.code == CANCELLED:  # a thread that still compiles a kernel would hold the process up for a minute
-            sys.stderr.flush()
-            os._exit(CANCELLED)
-        raise
-
-
-if __name__ == "__main__":
-    main()
+    return ("default", *(word for word in words(text) if word != "default"))

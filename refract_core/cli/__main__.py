@@ -1,0 +1,5 @@
+"""`python -m refract_core.cli`."""
+
+from . import main
+
+main()

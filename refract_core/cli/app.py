@@ -1,0 +1,99 @@
+"""What every command of `refract` shares: the app, common options, and how a command ends."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Annotated
+
+import typer
+
+from ..errors import RefractError, UsageError
+from ..progress import Report, reporting
+from ..version import __version__
+
+CANCELLED = 3
+
+app = typer.Typer(
+    help="Render USD stages with glass in them, without a GPU or a display.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # the boxes cut long option names off
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"refract {__version__}")
+        raise typer.Exit
+
+
+Version = Annotated[
+    bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+]
+Jobs = Annotated[int | None, typer.Option(help="Threads to use; 0, the default, means all cores.")]
+ProgressMode = Annotated[
+    str,
+    typer.Option(
+        "--progress",
+        metavar="auto|json|none",
+        help="How progress is told on stderr: auto is a bar on a terminal, json is one object per line.",
+    ),
+]
+
+
+@app.callback()
+def refract(version: Version = False) -> None:
+    """Render USD stages with glass in them, without a GPU or a display.
+
+    Exit codes: 0 done, 1 failed, 2 wrong usage, 3 cancelled.
+    """
+
+
+def words(text: str) -> tuple[str, ...]:
+    return tuple(word.strip() for word in text.split(",") if word.strip())
+
+
+@contextmanager
+def outcome(progress: str) -> Iterator[tuple[Report, Callable[[], bool]]]:
+    """Turn errors into a line on stderr and the exit code, and Ctrl-C into a wish to stop."""
+    try:
+        with reporting(progress) as report, _interrupts() as cancel:
+            try:
+                yield report, cancel
+            except RefractError as error:
+                report.error(str(error))
+                raise typer.Exit(error.exit_code) from error
+            except MemoryError as error:
+                report.error("out of memory; make the picture smaller, or the stage simpler")
+                raise typer.Exit(1) from error
+            except KeyboardInterrupt as error:
+                report.error("cancelled")
+                raise typer.Exit(CANCELLED) from error
+    except UsageError as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(error.exit_code) from error
+
+
+@contextmanager
+def _interrupts() -> Iterator[Callable[[], bool]]:
+    """The first Ctrl-C asks the work to stop at its next chance; a second one stops it where it is."""
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may listen to signals
+        yield lambda: False
+        return
+    asked = threading.Event()
+
+    def on_interrupt(_signal: int, _frame: FrameType | None) -> None:
+        if asked.is_set():
+            raise KeyboardInterrupt
+        asked.set()
+
+    before = signal.signal(signal.SIGINT, on_interrupt)
+    try:
+        yield asked.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)
