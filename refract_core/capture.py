@@ -1,203 +1,206 @@
-"""Which probes serve a picture, and drawing the ones that have no texture.
-
-A stage's own probes come in HDRP's order. Where the stage has none, glass gets its own: captured at its centre, with
-the scene's bounds as proxy (Arm's preparation steps: stand in the object, hide it, draw six faces).
-"""
+"""Drawing the pictures of probes: rays, borders, blurred levels; or the levels that a file brought along."""
 
 from __future__ import annotations
 
-import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .embree import FIRST_CAPTURED_BIT, OPAQUE, OPAQUE_STATIC
+from .embree import BLOCK_HEIGHT, BLOCK_WIDTH, COHERENT, LANES, clear, set_ray
+from .faces import (
+    CUBE,
+    TEXEL,
+    WINDOW,
+    Levels,
+    averages,
+    face_direction,
+    fill_cube_border,
+    fill_window_border,
+    filter_face,
+    halve,
+    lobe_samples,
+    view_of_level,
+)
+from .kernel import inlined, kernel
+from .plan import Entry
+from .planar import seen_from
 from .pointer import Pointer
-from .probes import TEXEL, ProbeTable, capture_rows, empty_table, face_direction, fill_levels, in_order
-from .scene import Camera, Probe, Scene, Texture, Volume
+from .probes import ProbeTable
+from .sampling import pixel_offset
+from .scene import Cubemap
 from .scratch import scratch
-from .srgb import srgb_decode
-from .tables import prim_of
+from .shading import load_hits, shade
+from .tracing import intersect_world
+from .vec import along, length, normalize, row, scale, transform_direction, transform_point
 
-_MAX_OWN = 8
-"""Glass beyond this many things shares capture points with its neighbours."""
-_MAX_SETS = 31 - FIRST_CAPTURED_BIT
-_EVERYWHERE = 1e9  # half size of an influence without limits [m]
 _ROWS = 32  # rows of a face that one task draws; a multiple of 4
+_BEFORE_WINDOW = 1e-4  # rays start this much before the window, so that what lies in its plane is seen [m]
 
 
-class Entry(NamedTuple):
-    """One probe of the picture."""
+@kernel
+def capture_rows(world, table, scratch, k, face, y0, y1, volume, mask, near, far, background, jitter):  # type: ignore[no-untyped-def]
+    """Draw rows y0 .. y1 (y0 a multiple of 4, border not counted) of one face of probe `k`. Returns rays traced.
 
-    probe: Probe
-    owned: bool
-    """it serves only the things that `Plan.thing_probe` gives it"""
-    mask: int
-    """what it sees"""
-    drawn: bool
-    """False: it lends its proxy to the screen tier and shows nothing"""
-
-
-class Plan(NamedTuple):
-    """What to capture, decided before the BVH is built, because masks depend on it."""
-
-    entries: list[Entry]
-    thing_probe: NDArray[np.int32]
-    """shape (things,): the entry whose proxy serves a thing, -1 for opaque things"""
-    captured_sets: list[frozenset[str] | None]
-
-
-def plan(scene: Scene, height: int, wanted: bool) -> Plan:
-    """Choose the probes. `height`: of the picture [pixels], to which the resolution of own probes is fitted."""
-    glass = _glass(scene)
-    count = len(scene.meshes) + len(scene.spheres)
-    thing_probe = np.full(count, -1, np.int32)
-    if not wanted or not glass:
-        return Plan([], thing_probe, [])
-    entries: list[Entry] = []
-    sets: list[frozenset[str] | None] = []
-    for probe in in_order(list(scene.probes)):
-        entries.append(Entry(probe, False, _mask_of(scene, probe, sets), True))
-    for k, entry in reversed(list(enumerate(entries))):
-        for thing, (low, high) in glass.items():
-            if contains(entry.probe.influence, (low + high) / 2):
-                thing_probe[thing] = k
-    alone = {thing: box for thing, box in glass.items() if thing_probe[thing] < 0}
-    _add_own(entries, alone, thing_probe, scene, height, drawn=not scene.probes)
-    return Plan(entries, thing_probe, sets)
-
-
-def _glass(scene: Scene) -> dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Bounds of every thing with a refractive material, by its number."""
-    refractive = np.array([m.refractive for m in scene.materials], bool)
-    found = {}
-    for thing, mesh in enumerate(scene.meshes):
-        keep = refractive[mesh.materials]
-        if keep.any():
-            points = mesh.points[mesh.triangles[keep].ravel()].astype(np.float64)
-            found[thing] = (points.min(0), points.max(0))
-    for i, ball in enumerate(scene.spheres):
-        if refractive[ball.material]:
-            centre = np.array(ball.centre, np.float64)
-            found[len(scene.meshes) + i] = (centre - ball.radius, centre + ball.radius)
-    return found
+    Args:
+        volume: shape (4, 4) world_from_volume of its influence.
+        near, far: along the axis of a cube's face; a window has its plane for a near plane [m].
+        background: shape (4,): radiance where nothing is met, and 1, or zeros for the sky.
+        jitter: shape (S, 2): place of each sample within its texel, -0.5 .. 0.5.
+    """
+    packet, block, second, limit = scratch.packet, scratch.block, scratch.second, scratch.far
+    packet.tally[0] = 0
+    n = table.side[k, 0]
+    planar = table.planar[k] != 0
+    for by in range(y0, y1, BLOCK_HEIGHT):
+        for bx in range(0, n, BLOCK_WIDTH):
+            for sample in range(jitter.shape[0]):
+                clear(packet)
+                spread = 2.0 / n
+                for lane in range(LANES):
+                    x, y = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
+                    if x >= n or y >= y1:
+                        continue
+                    block.pixel[lane, 0], block.pixel[lane, 1] = x + n * face, y + 4099 * (k + 1)
+                    u = (x + 0.5 + jitter[sample, 0]) / n * 2.0 - 1.0
+                    v = (y + 0.5 + jitter[sample, 1]) / n * 2.0 - 1.0
+                    if planar:
+                        spread = _add_window_ray(packet, table, lane, k, face, u, v, volume, far, mask)
+                        limit[lane] = far
+                        continue
+                    d = face_direction(face, u, v)
+                    stretch = length(d)
+                    limit[lane] = far * stretch
+                    centre = row(table.capture, k)
+                    set_ray(packet, lane, centre, scale(d, 1.0 / stretch), near * stretch, limit[lane], mask)
+                intersect_world(packet, world, limit, COHERENT)
+                load_hits(block, packet, world, spread)
+                shade(block, second, packet, world, sample, mask)
+                _keep_texels(table, k, face, bx, by, y1, block, background, 1.0 / jitter.shape[0])
+    return packet.tally[0]
 
 
-def _mask_of(scene: Scene, probe: Probe, sets: list[frozenset[str] | None]) -> int:
-    baked = probe.mode != "realtime"
-    if probe.captured is None or len(sets) >= _MAX_SETS:
-        return int(OPAQUE_STATIC if baked else OPAQUE)
-    wanted = set(probe.captured)
-    things = [(m.path, m.static) for m in scene.meshes] + [(s.path, s.static) for s in scene.spheres]
-    seen = frozenset(prim_of(path) for path, static in things if prim_of(path) in wanted and (static or not baked))
-    if seen not in sets:
-        sets.append(seen)
-    return 1 << (FIRST_CAPTURED_BIT + sets.index(seen))
+@inlined
+def _add_window_ray(packet, table, lane, k, face, u, v, volume, far, mask):  # type: ignore[no-untyped-def]
+    """The ray through one place of a planar probe's window. Returns the spread of a texel's rays [rad]."""
+    ex, ey = table.influence_extents[k, 0], table.influence_extents[k, 1]
+    c = seen_from(table.eye[k], face)
+    q = (u * ex, -v * ey, 0.0)
+    towards = (q[0] - c[0], q[1] - c[1], -c[2]) if c[3] != 0.0 else (-c[0], -c[1], -c[2])
+    d = normalize(transform_direction(volume, towards))
+    start = along(transform_point(volume, q), d, -_BEFORE_WINDOW)
+    set_ray(packet, lane, start, d, 0.0, far, mask)
+    if c[3] == 0.0:
+        return 0.0
+    return 2.0 * max(ex, ey) / table.side[k, 0] / max(length(towards), 1e-6)
 
 
-def contains(volume: Volume, point: NDArray[np.float64]) -> bool:
-    """The point is inside the box or sphere."""
-    m = np.linalg.inv(volume.world_from_volume)
-    p = m[:3, :3] @ point + m[:3, 3]
-    if volume.sphere:
-        return bool(np.linalg.norm(p) <= volume.extents[0])
-    return bool((np.abs(p) <= np.array(volume.extents)).all())
+@inlined
+def _keep_texels(table, k, face, bx, by, y1, block, background, share):  # type: ignore[no-untyped-def]
+    n = table.side[k, 0]
+    stride = n + 2
+    for lane in range(LANES):
+        x, y = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
+        if x >= n or y >= y1:
+            continue
+        i = table.first[k, 0] + ((face * stride + y + 1) * stride + x + 1) * TEXEL
+        if block.on[lane] == 0:
+            for c in range(4):
+                table.texels[i + c] += background[c] * share
+            continue
+        for c in range(3):
+            table.texels[i + c] += block.color[lane, c] * share
+        table.texels[i + 3] += share
+        table.texels[i + 4] += block.distance[lane] * share
 
 
-def _add_own(
-    entries: list[Entry], alone: dict[int, Any], thing_probe: NDArray[np.int32], scene: Scene, height: int, drawn: bool
-) -> None:
-    """Give every thing in `alone` a probe at its centre; many things share the nearest of a few, spread widely."""
-    if not alone:
-        return
-    things = sorted(alone, key=lambda thing: -float(np.prod(alone[thing][1] - alone[thing][0] + 1e-9)))
-    centres = np.array([(alone[thing][0] + alone[thing][1]) / 2 for thing in things])
-    chosen = [0]
-    while len(chosen) < min(_MAX_OWN, len(things)):
-        away = np.min(np.linalg.norm(centres[:, None] - centres[chosen][None], axis=2), axis=1)
-        chosen.append(int(np.argmax(away)))
-    nearest = np.argmin(np.linalg.norm(centres[:, None] - centres[chosen][None], axis=2), axis=1)
-    base = len(entries)
-    for i in chosen:
-        proxy = scene.bounds if drawn else tuple(tuple(side) for side in alone[things[i]])
-        entries.append(Entry(_own_probe(centres[i], proxy, height), True, int(OPAQUE), drawn))
-    for thing, group in zip(things, nearest, strict=True):
-        thing_probe[thing] = base + group
-
-
-def _own_probe(centre: NDArray[np.float64], proxy: Any, height: int) -> Probe:
-    low, high = np.array(proxy[0], np.float64), np.array(proxy[1], np.float64)
-    frame = np.eye(4)
-    frame[:3, 3] = (low + high) / 2
-    half = np.maximum((high - low) / 2, 1e-3) * 1.0005
-    here = np.eye(4)
-    here[:3, 3] = centre
-    return Probe(
-        path="",
-        mode="realtime",
-        capture_point=(float(centre[0]), float(centre[1]), float(centre[2])),
-        influence=Volume(here, False, (_EVERYWHERE,) * 3),
-        proxy=Volume(frame, False, (float(half[0]), float(half[1]), float(half[2]))),
-        resolution=1 << min(9, max(5, round(math.log2(max(height, 1) / 5)))),
-        clipping=(1e-4, 1e9),
-    )
-
-
-def capture(plan: Plan, world: Pointer, camera: Camera, run: Any, samples: int) -> tuple[ProbeTable, int]:
-    """Fill the table: textures are resampled, the rest is drawn on all cores.
+def fill_table(table: ProbeTable, entries: list[Entry], world: Pointer, run: Any, samples: int) -> int:
+    """Draw every picture that no file brought, and make the levels of all.
 
     Args:
         run: `run(function, items)` maps over tasks and returns their results in order.
         samples: rays per texel.
 
     Returns:
-        The table and the number of rays traced.
+        Rays traced.
     """
-    table = empty_table([(e.probe, e.owned) for e in plan.entries], camera.world_from_camera[:3, 3])
     pointer = Pointer(table)
-    tasks = []
-    for k, entry in enumerate(plan.entries):
+    jitter = np.array([pixel_offset(i) for i in range(samples)], np.float64)
+    jitter -= jitter.mean(0)  # few samples lean to one side, and the whole picture would stand askew
+    tasks: list[tuple[int, int, int]] = []
+    for k, entry in enumerate(entries):
         if not entry.drawn:
             table.weight[k] = 0.0
-        elif entry.probe.texture is not None:
-            _resample(table, k, entry.probe.texture)
+        elif entry.probe.cubemap is not None:
+            _copy_levels(table, k, entry.probe.cubemap)
         else:
-            rows = range(0, entry.probe.resolution + 2, _ROWS)
-            tasks += [(k, face, y) for face in range(6) for y in rows]
+            faces = WINDOW if entry.probe.planar else CUBE
+            tasks += [(k, face, y) for face in range(faces) for y in range(0, int(table.side[k, 0]), _ROWS)]
 
     def draw(task: tuple[int, int, int]) -> int:
         k, face, y = task
-        entry = plan.entries[k]
-        stop = min(y + _ROWS, entry.probe.resolution + 2)
-        near, far = entry.probe.clipping
-        return int(capture_rows(world, pointer, scratch(), k, face, y, stop, entry.mask, near, far, samples))
+        probe = entries[k].probe
+        stop = min(y + _ROWS, int(table.side[k, 0]))
+        near, far = probe.clipping
+        volume = np.ascontiguousarray(probe.influence.world_from_volume, np.float64)
+        background = np.array([*probe.background, 1.0] if probe.background else [0.0] * 4)
+        here = scratch()
+        return int(
+            capture_rows(world, pointer, here, k, face, y, stop, volume, entries[k].mask, near, far, background, jitter)
+        )
 
     rays = sum(run(draw, tasks))
-    run(lambda k: fill_levels(pointer, k), [k for k, entry in enumerate(plan.entries) if entry.drawn])
-    return table, rays
+    _fill_levels(table, [k for k, entry in enumerate(entries) if entry.drawn], entries, run)
+    return rays
 
 
-def _resample(table: ProbeTable, k: int, texture: Texture) -> None:
-    """A latlong or a strip of six faces into the probe's texels. World axes, as HDRP: the capture is not rotated."""
-    pixels = texture.pixels.astype(np.float32)
-    if texture.pixels.dtype == np.uint8:
-        pixels = pixels / 255.0
-        if texture.srgb:
-            pixels[..., :3] = srgb_decode(pixels[..., :3])
-    h, w = pixels.shape[:2]
-    res = int(table.resolution[k])
-    stride = res + 2
-    out = table.texels[table.first[k, 0] : table.first[k, 0] + 6 * stride * stride * TEXEL]
-    faces = out.reshape(6, stride, stride, TEXEL)
-    for face in range(6):
-        for j in range(stride):
-            x = (np.arange(stride) - 0.5) / res * 2 - 1
-            y = (j - 0.5) / res * 2 - 1
-            d = np.array([face_direction(face, xi, y) for xi in x])
-            d /= np.linalg.norm(d, axis=1, keepdims=True)
-            u = (0.5 - np.arctan2(d[:, 0], d[:, 2]) / (2 * np.pi)) % 1.0
-            v = np.arccos(np.clip(d[:, 1], -1, 1)) / np.pi
-            faces[face, j, :, :3] = pixels[np.minimum((v * h).astype(int), h - 1), (u * w).astype(int) % w, :3]
-    faces[..., 3] = 1.0
-    faces[..., 4] = np.linalg.norm(table.proxy_extents[k])
+def _fill_levels(table: ProbeTable, drawn: list[int], entries: list[Entry], run: Any) -> None:
+    """Borders everywhere, and the levels above 0 of those that need them."""
+
+    def start(k: int) -> list[tuple[Any, ...]]:
+        """Border of level 0; what is left to be done for the levels above."""
+        if table.planar[k]:
+            _average_window(table, k)
+            return []
+        fill_cube_border(table.texels, int(table.first[k, 0]), int(table.side[k, 0]))
+        cubemap = entries[k].probe.cubemap
+        if table.last[k] == 0 or (cubemap is not None and len(cubemap.levels) > 1):
+            return []
+        pool, levels = averages(table.texels, int(table.first[k, 0]), int(table.side[k, 0]))
+        return [(k, level, face, pool, levels) for level in range(1, int(table.last[k]) + 1) for face in range(CUBE)]
+
+    def blur(task: tuple[int, int, int, NDArray[np.float32], Levels]) -> None:
+        k, level, face, pool, levels = task
+        first, n = int(table.first[k, level]), int(table.side[k, level])
+        lobe = lobe_samples(level, int(table.side[k, 0]))
+        filter_face(pool, levels.first, levels.side, table.texels, first, n, face, lobe)
+
+    def finish(k: int) -> None:
+        for level in range(1, int(table.last[k]) + 1):
+            fill_cube_border(table.texels, int(table.first[k, level]), int(table.side[k, level]))
+
+    run(blur, [task for tasks in run(start, drawn) for task in tasks])
+    run(finish, [k for k in drawn if not table.planar[k]])
+
+
+def _average_window(table: ProbeTable, k: int) -> None:
+    pool = table.texels
+    for level in range(int(table.last[k]) + 1):
+        first, n = int(table.first[k, level]), int(table.side[k, level])
+        if level > 0:
+            below, m = int(table.first[k, level - 1]), int(table.side[k, level - 1])
+            halve(pool, below, m, pool, first, n, WINDOW)
+        fill_window_border(pool, first, n)
+
+
+def _copy_levels(table: ProbeTable, k: int, cubemap: Cubemap) -> None:
+    levels = Levels(table.first[k], table.side[k])
+    for level, faces in enumerate(cubemap.levels[: int(table.last[k]) + 1]):
+        view_of_level(table.texels, levels, level, CUBE)[:, 1:-1, 1:-1] = faces
+
+
+def cubemap_of(table: ProbeTable, k: int) -> Cubemap:
+    """The picture of a cube probe, out of the table."""
+    levels = Levels(table.first[k], table.side[k])
+    count = int(table.last[k]) + 1
+    return Cubemap(tuple(view_of_level(table.texels, levels, m, CUBE)[:, 1:-1, 1:-1].copy() for m in range(count)))

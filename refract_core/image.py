@@ -1,12 +1,13 @@
-"""Image files in and out. The only room that knows OpenImageIO, which is loaded with the first file."""
+"""Image files in and out: textures, pictures, and (from the room beside it) cubemaps.
+
+OpenImageIO is known here, in `image_files` and in `image_cubemaps` alone, and loaded with the first file.
+"""
 
 from __future__ import annotations
 
 import os
-import secrets
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +16,27 @@ from numpy.typing import NDArray
 
 from .aovs import AOVS, check_names, shape_of
 from .errors import ImageError, UsageError
+from .image_cubemaps import read_cubemap, write_cubemap
+from .image_files import HALF_MAX, MAX_TEXTURE_PIXELS, encoded, extension_of, named_file, read_pixels, reason, replacing
 from .scene import F32, Texture
 from .srgb import srgb_decode, srgb_encode
+
+__all__ = [
+    "MAX_TEXTURE_PIXELS",
+    "check_output",
+    "check_writable",
+    "default_aovs",
+    "display",
+    "read_cubemap",
+    "read_texture",
+    "write_cubemap",
+    "write_frame",
+]
 
 COLOR_SPACES = ("auto", "raw", "sRGB")
 COLOR_CORRECTIONS = ("disabled", "sRGB", "openColorIO")
 LAYERED = (".exr",)
 EIGHT_BIT = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
-MAX_TEXTURE_PIXELS = 1 << 28
-HALF_MAX = 65504.0
-
-_PNG_END = b"IEND\xaeB`\x82"
 _STRAIGHT_ALPHA = "oiio:UnassociatedAlpha"
 _LINEAR_REC709 = "lin_rec709_scene"
 
@@ -50,109 +61,14 @@ def read_texture(source: str | bytes, *, name: str, color_space: str) -> Texture
     """
     if color_space not in COLOR_SPACES:
         raise ImageError(f"{name}: colour space is '{color_space}'; choose from {', '.join(COLOR_SPACES)}")
-    with _named_file(source, name) as path:
-        pixels, channels, integer = _read_pixels(path, name)
+    with named_file(source, name) as path:
+        pixels, channels, integer, _ = read_pixels(path, name)
     if pixels.dtype == np.uint8:
         srgb = color_space == "sRGB" or (color_space == "auto" and channels >= 3)
         return Texture(name, pixels, srgb)
     if integer and color_space == "sRGB":
         pixels[..., :3] = srgb_decode(pixels[..., :3])
     return Texture(name, pixels)
-
-
-@contextmanager
-def _named_file(source: str | bytes, name: str) -> Iterator[str]:
-    """A path OpenImageIO can open: its Python binding reads no bytes."""
-    if isinstance(source, bytes):
-        with _memory_file() as path:
-            Path(path).write_bytes(source)
-            yield path
-    elif os.path.isfile(source):
-        yield source
-    else:
-        raise ImageError(f"{name}: the file does not exist; correct the path or add the file")
-
-
-@contextmanager
-def _memory_file() -> Iterator[str]:
-    """Path of an empty file in memory (where the system has that), which also works where nothing may be written."""
-    if hasattr(os, "memfd_create"):
-        descriptor = os.memfd_create("image")
-        try:
-            yield f"/proc/self/fd/{descriptor}"
-        finally:
-            os.close(descriptor)
-    else:
-        with tempfile.TemporaryDirectory() as folder:
-            yield os.path.join(folder, "image")
-
-
-def _read_pixels(path: str, name: str) -> tuple[NDArray[Any], int, bool]:
-    """RGBA of the first image in a file, its own channel count, and whether it holds integers."""
-    import OpenImageIO as oiio
-
-    config = oiio.ImageSpec()
-    config.attribute(_STRAIGHT_ALPHA, 1)
-    file = oiio.ImageInput.open(path, config)
-    if file is None:
-        raise ImageError(f"{name}: not a readable image: {_reason(oiio.geterror(), path)}")
-    try:
-        spec = file.spec()
-        if spec.depth > 1 or spec.nchannels < 1:
-            raise ImageError(f"{name}: a volume or an empty image cannot be a texture; give a flat picture")
-        pixel_count = max(spec.width * spec.height, spec.full_width * spec.full_height)
-        if pixel_count * max(spec.nchannels, 4) > MAX_TEXTURE_PIXELS * 4:
-            raise ImageError(
-                f"{name}: {spec.width} x {spec.height} x {spec.nchannels} channels is over {MAX_TEXTURE_PIXELS} RGBA "
-                "pixels; give a smaller image"
-            )
-        small = spec.format.basetype in (oiio.UINT8, oiio.INT8)
-        integer = spec.format.basetype not in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
-        pixels = file.read_image(0, 0, 0, spec.nchannels, oiio.UINT8 if small else oiio.FLOAT)
-        if pixels is None:
-            raise ImageError(f"{name}: damaged image: {_reason(file.geterror(), path)}")
-        pixels = pixels.reshape(spec.height, spec.width, spec.nchannels)
-        return _rgba(_display_window(pixels, spec), spec), spec.nchannels, integer
-    finally:
-        file.close()
-
-
-def _reason(message: str, path: str = "") -> str:
-    """First line of a library's message, which may be empty or long, without the path it knows."""
-    lines = (message.replace(path, "the file") if path else message).strip().splitlines()
-    return lines[0] if lines else "no reason given"
-
-
-def _display_window(pixels: NDArray[Any], spec: Any) -> NDArray[Any]:
-    """Pixels of the display window; what the data window lacks is 0 (OpenEXR, "Technical Introduction")."""
-    if (spec.x, spec.y, spec.width, spec.height) == (spec.full_x, spec.full_y, spec.full_width, spec.full_height):
-        return pixels
-    shown = np.zeros((spec.full_height, spec.full_width, spec.nchannels), pixels.dtype)
-    x, y = spec.x - spec.full_x, spec.y - spec.full_y
-    left, right = max(x, 0), min(x + spec.width, spec.full_width)
-    top, bottom = max(y, 0), min(y + spec.height, spec.full_height)
-    if left < right and top < bottom:
-        shown[top:bottom, left:right] = pixels[top - y : bottom - y, left - x : right - x]
-    return shown
-
-
-def _rgba(pixels: NDArray[Any], spec: Any) -> NDArray[Any]:
-    names = list(spec.channelnames)
-    count = spec.nchannels
-    alpha = spec.alpha_channel
-    if not 0 <= alpha < count:  # unnamed fourth or second channels are alpha; a depth is not
-        alpha = count - 1 if count in (2, 4) and spec.z_channel != count - 1 else -1
-    if count > 4 and all(c in names for c in "RGB"):
-        rgb = [names.index(c) for c in "RGB"]
-    else:
-        rgb = [0, 1, 2] if count >= 3 else [0, 0, 0]
-    opaque = 255 if pixels.dtype == np.uint8 else 1.0
-    if count == 4 and alpha == 3:
-        return np.ascontiguousarray(pixels)
-    out = np.empty((*pixels.shape[:2], 4), pixels.dtype)
-    out[..., :3] = pixels[..., rgb]
-    out[..., 3] = pixels[..., alpha] if alpha >= 0 else opaque
-    return out
 
 
 # --- writing -----------------------------------------------------------------------------------------------------
@@ -235,51 +151,17 @@ def write_frame(
     else:
         ((name, plane),) = planes.items()
         pixels, spec = _eight_bit(path, name, plane, metadata, color_correction)
-    data = _encoded(path, pixels, spec)
-    with _replacing(path) as temporary:
+    data = encoded(path, pixels, spec)
+    with replacing(path) as temporary:
         Path(temporary).write_bytes(data)
 
 
 def _extension(path: str) -> str:
-    extension = os.path.splitext(path)[1].lower()
+    extension = extension_of(path)
     if extension not in LAYERED + EIGHT_BIT:
         known = ", ".join(LAYERED + EIGHT_BIT)
         raise UsageError(f"{path}: '{extension}' is not a known image extension; use one of {known}")
     return extension
-
-
-@contextmanager
-def _replacing(path: str) -> Iterator[str]:
-    """A name beside `path` that becomes `path` when the block ends well, and is removed when it does not."""
-    folder, base = os.path.split(path)
-    stem, extension = os.path.splitext(base)
-    temporary = os.path.join(folder, f".{stem[:32]}.{secrets.token_hex(4)}{extension}")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    except OSError as error:
-        raise ImageError(f"{path}: cannot be written: {error.strerror}; choose another place") from error
-    finally:
-        Path(temporary).unlink(missing_ok=True)
-
-
-def _encoded(path: str, pixels: NDArray[Any], spec: Any) -> bytes:
-    """The whole file in memory: on a full disk some writers say nothing, and one ends the process."""
-    import OpenImageIO as oiio
-
-    with _memory_file() as name:
-        file = oiio.ImageOutput.create(_extension(path)[1:])
-        if file is None:
-            raise ImageError(f"{path}: cannot be encoded: {_reason(oiio.geterror())}")
-        opened = file.open(name, spec)
-        written = opened and file.write_image(pixels)
-        closed = opened and file.close()
-        if not (written and closed):
-            raise ImageError(f"{path}: cannot be encoded: {_reason(file.geterror(), name)}")
-        data = Path(name).read_bytes()
-    if _extension(path) == ".png" and not data.endswith(_PNG_END):
-        raise ImageError(f"{path}: cannot be encoded: out of memory, or over the limit on file sizes")
-    return data
 
 
 def _exr(planes: Mapping[str, F32], metadata: Mapping[str, str | float], height: int, width: int) -> tuple[F32, Any]:
@@ -364,7 +246,7 @@ def _corrected(rgb: F32, color_correction: str) -> F32:
     shown = oiio.ImageBufAlgo.ociodisplay(oiio.ImageBuf(rgb), "", "", _LINEAR_REC709)
     if shown.has_error:
         raise UsageError(
-            f"color correction mode openColorIO: {_reason(shown.geterror())}; "
+            f"color correction mode openColorIO: {reason(shown.geterror())}; "
             "set OCIO to a config with a default view, unset it, or use sRGB"
         )
     return np.asarray(shown.get_pixels(oiio.FLOAT), np.float32).reshape(rgb.shape)

@@ -1,11 +1,8 @@
-"""The probe tier: cubemaps captured in the scene, looked up with local correction where their influence reaches.
+"""The probe tier: pictures taken in the scene, looked up with local correction where their influence reaches.
 
-A capture keeps colour, coverage (0 where the sky is seen) and distance. Where a texel shows the sky, the probe hands
+A picture keeps colour, coverage (0 where the sky is seen) and distance. Where a texel shows the sky, the probe hands
 its share on to the sky tier, which knows the direction exactly (Arm, "Combining reflections from a distant
-environment"); where no sky tier follows, the sky's colour is in the capture.
-
-Faces are +x -x +y -y +z -z, each `RES + 2` texels wide: one texel beyond the face on every side, captured too, so that
-bilinear lookups are seamless.
+environment"); where no sky tier follows, the probe adds the sky itself.
 """
 
 from __future__ import annotations
@@ -16,32 +13,41 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .embree import BLOCK_HEIGHT, BLOCK_WIDTH, COHERENT, LANES, clear, set_ray
-from .environment import radiance
-from .kernel import inlined, kernel
-from .scene import Probe
-from .shading import load_hits, shade
-from .tracing import intersect_world
-from .vec import along, length, normalize, row, scale, sub, transform_direction, transform_point
+from .environment import prefiltered
+from .faces import CUBE, WINDOW, direction_face, layout, level_at, level_count
+from .kernel import inlined
+from .optics_scalar import probe_lod_hdrp
+from .planar import window_of, window_weight
+from .reach import Reach, reach_of
+from .scene import Camera, Probe
+from .vec import along, length, row, scale, sub, transform_direction, transform_point
 from .volumes import INFINITE_DISTANCE, distance_fade, influence_box, influence_sphere, ray_box, ray_sphere
 
-TEXEL = 5
-"""Floats per texel: red, green, blue (sky left out), coverage, distance [m]."""
+_AVERAGE_MEDIAN = 0.59
+"""Median radius of a level-0 texel looked up bilinearly, in texels; it doubles with every level of averages."""
 
 
 class ProbeTable(NamedTuple):
     """All probes in the order in which they are asked: importance, then smaller volume (HDRP, 4.7)."""
 
     texels: NDArray[np.float32]
-    """flat pool: per probe, level, face, row, column, TEXEL floats"""
+    """flat pool of every picture's levels (see `faces`)"""
     first: NDArray[np.int64]
     """shape (K, L): offset of each level in the pool"""
-    resolution: NDArray[np.int64]
-    """shape (K,): texels across level 0, without the border"""
+    side: NDArray[np.int64]
+    """shape (K, L): texels on a side of each level"""
+    last: NDArray[np.int64]
+    """shape (K,): highest level"""
+    planar: NDArray[np.uint8]
     capture: NDArray[np.float64]
     """shape (K, 3) [m]"""
+    eye: NDArray[np.float64]
+    """shape (K, 4): the camera in the influence volume's frame, homogeneous: a point [m] and 1, or for an orthographic
+    camera the direction towards it and 0"""
     owned: NDArray[np.uint8]
     """shape (K,): 1 where it serves only the things that are given to it"""
+    reach: Reach
+    """of the influence volumes of those that serve everything"""
     influence: NDArray[np.float64]
     """shape (K, 4, 4) volume_from_world"""
     influence_sphere: NDArray[np.uint8]
@@ -59,50 +65,58 @@ class ProbeTable(NamedTuple):
     weight: NDArray[np.float64]
     """shape (K,): weight with the fade by distance to the camera in it"""
     multiplier: NDArray[np.float64]
+    sharp_near: NDArray[np.uint8]
+    """shape (K,): HDRP's distance-based roughness"""
 
 
-def in_order(probes: list[Probe]) -> list[Probe]:
-    """Higher importance first, then smaller influence volume, then as given."""
-
-    def volume(probe: Probe) -> float:
-        x, y, z = probe.influence.extents
-        return x * y * z
-
-    return sorted(probes, key=lambda probe: (-probe.importance, volume(probe)))
+def camera_weight(probe: Probe, eye: NDArray[np.float64]) -> float:
+    """The probe's weight with its fade by the distance of its origin to the camera at `eye`."""
+    distance = float(np.linalg.norm(probe.influence.world_from_volume[:3, 3] - eye))
+    return probe.weight * distance_fade(distance, max(probe.fade_distance, 1e-6))
 
 
-def level_count(resolution: int) -> int:
-    return max(1, int(math.log2(resolution)) - 1)
+def bounds_of(probe: Probe) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Low and high corner of the influence volume in engine world [m]."""
+    m, extents = probe.influence.world_from_volume, np.array(probe.influence.extents)
+    half = extents if probe.influence.sphere else np.abs(m[:3, :3]) @ extents
+    return m[:3, 3] - half, m[:3, 3] + half
 
 
-def empty_table(probes: list[tuple[Probe, bool]], eye: NDArray[np.float64]) -> ProbeTable:
-    """A table with room for every level of every probe; `capture_tile` and `fill_levels` fill the texels."""
-    k = len(probes)
-    levels = max([level_count(p.resolution) for p, _ in probes], default=1)
-    first = np.full((k, levels), -1, np.int64)
+def empty_table(probes: list[Probe], owned: list[bool], camera: Camera, rough: bool) -> ProbeTable:
+    """A table with room for every level of every probe; `capture` fills the texels."""
+    count = len(probes)
+    faces = [WINDOW if p.planar else CUBE for p in probes]
+    sizes = [p.cubemap.resolution if p.cubemap else p.resolution for p in probes]
+    levels = [level_count(n, f, rough) for n, f in zip(sizes, faces, strict=True)]
+    first = np.full((count, max(levels, default=1)), -1, np.int64)
+    side = np.ones_like(first)
     total = 0
-    for i, (probe, _) in enumerate(probes):
-        for level in range(level_count(probe.resolution)):
-            first[i, level] = total
-            total += 6 * ((probe.resolution >> level) + 2) ** 2 * TEXEL
+    for k in range(count):
+        where, total = layout(sizes[k], levels[k], faces[k], total)
+        first[k, : levels[k]], side[k, : levels[k]] = where
+    eye = camera.world_from_camera[:3, 3]
+    towards = np.array([*camera.world_from_camera[:3, 2], 0.0]) if camera.orthographic else np.array([*eye, 1.0])
 
     def each(get: Any, dtype: Any, shape: tuple[int, ...] = ()) -> NDArray[Any]:
-        return np.array([get(p) for p, _ in probes], dtype).reshape((k, *shape))
+        return np.array([get(p) for p in probes], dtype).reshape((count, *shape))
 
     def kind(p: Probe) -> int:
         return 2 if p.proxy is None else int(p.proxy.sphere)
 
-    def fade(p: Probe) -> float:
-        distance = float(np.linalg.norm(p.influence.world_from_volume[:3, 3] - eye))
-        return p.weight * distance_fade(distance, max(p.fade_distance, 1e-6))
-
+    inverse = each(lambda p: np.linalg.inv(p.influence.world_from_volume), np.float64, (4, 4))
+    bounds = np.array([bounds_of(p) for p in probes], np.float64).reshape(count, 2, 3)
+    bounds[np.array(owned, bool)] = np.inf  # out of everybody's reach
     return ProbeTable(
         texels=np.zeros(total, np.float32),
         first=first,
-        resolution=each(lambda p: p.resolution, np.int64),
+        side=side,
+        last=np.array(levels, np.int64) - 1,
+        planar=each(lambda p: p.planar, np.uint8),
         capture=each(lambda p: p.capture_point, np.float64, (3,)),
-        owned=np.array([owned for _, owned in probes], np.uint8),
-        influence=each(lambda p: np.linalg.inv(p.influence.world_from_volume), np.float64, (4, 4)),
+        eye=np.ascontiguousarray(inverse @ towards),
+        owned=np.array(owned, np.uint8),
+        reach=reach_of(bounds[:, 0], bounds[:, 1]),
+        influence=inverse,
         influence_sphere=each(lambda p: p.influence.sphere, np.uint8),
         influence_extents=each(lambda p: p.influence.extents, np.float64, (3,)),
         proxy=each(lambda p: np.linalg.inv((p.proxy or p.influence).world_from_volume), np.float64, (4, 4)),
@@ -111,81 +125,13 @@ def empty_table(probes: list[tuple[Probe, bool]], eye: NDArray[np.float64]) -> P
         blend=each(lambda p: p.blend_distance, np.float64, (6,)),
         blend_normal=each(lambda p: p.blend_normal_distance, np.float64, (6,)),
         face_fade=each(lambda p: p.face_fade, np.float64, (6,)),
-        weight=each(fade, np.float64),
+        weight=each(lambda p: camera_weight(p, eye), np.float64),
         multiplier=each(lambda p: p.multiplier, np.float64),
+        sharp_near=each(lambda p: p.distance_roughness, np.uint8),
     )
 
 
-# ------------------------------------------------------------------------------------------------ cube geometry
-
-
-@inlined
-def face_direction(face, x, y):  # type: ignore[no-untyped-def]
-    """Unnormalised direction of face coordinates x, y in [-1, 1] (x right, y down, seen from the centre)."""
-    if face == 0:
-        return (1.0, -y, -x)
-    if face == 1:
-        return (-1.0, -y, x)
-    if face == 2:
-        return (x, 1.0, y)
-    if face == 3:
-        return (x, -1.0, -y)
-    if face == 4:
-        return (x, -y, 1.0)
-    return (-x, -y, -1.0)
-
-
-@inlined
-def direction_face(d):  # type: ignore[no-untyped-def]
-    """(face, x, y) that a direction meets: the inverse of `face_direction`."""
-    ax, ay, az = abs(d[0]), abs(d[1]), abs(d[2])
-    if ax >= ay and ax >= az:
-        return (0, -d[2] / ax, -d[1] / ax) if d[0] > 0.0 else (1, d[2] / ax, -d[1] / ax)
-    if ay >= az:
-        return (2, d[0] / ay, d[2] / ay) if d[1] > 0.0 else (3, d[0] / ay, -d[2] / ay)
-    return (4, d[0] / az, -d[1] / az) if d[2] > 0.0 else (5, -d[0] / az, -d[1] / az)
-
-
-@inlined
-def _texel(table, k, level, d):  # type: ignore[no-untyped-def]
-    """Bilinear texel of one level: (r, g, b, coverage, distance)."""
-    res = table.resolution[k] >> level
-    stride = res + 2
-    face, x, y = direction_face(d)
-    px = (x + 1.0) * 0.5 * res + 0.5
-    py = (y + 1.0) * 0.5 * res + 0.5
-    x0 = min(max(int(px), 0), stride - 2)
-    y0 = min(max(int(py), 0), stride - 2)
-    fx, fy = px - x0, py - y0
-    base = table.first[k, level] + ((face * stride + y0) * stride + x0) * TEXEL
-    below = base + stride * TEXEL
-    t = table.texels
-    wa, wb, wc, wd = (1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy
-    r = wa * t[base] + wb * t[base + 5] + wc * t[below] + wd * t[below + 5]
-    g = wa * t[base + 1] + wb * t[base + 6] + wc * t[below + 1] + wd * t[below + 6]
-    b = wa * t[base + 2] + wb * t[base + 7] + wc * t[below + 2] + wd * t[below + 7]
-    a = wa * t[base + 3] + wb * t[base + 8] + wc * t[below + 3] + wd * t[below + 8]
-    s = wa * t[base + 4] + wb * t[base + 9] + wc * t[below + 4] + wd * t[below + 9]
-    return r, g, b, a, s
-
-
-@inlined
-def cube_at(table, k, d, lod):  # type: ignore[no-untyped-def]
-    """Trilinear (r, g, b, coverage, distance) of probe `k` in a direction, which need not be unit."""
-    last = 0
-    while last + 1 < table.first.shape[1] and table.first[k, last + 1] >= 0:
-        last += 1
-    lod = min(max(lod, 0.0), float(last))
-    low = int(lod)
-    r, g, b, a, s = _texel(table, k, low, d)
-    f = lod - low
-    if f > 0.0 and low < last:
-        r1, g1, b1, a1, s1 = _texel(table, k, low + 1, d)
-        return r + (r1 - r) * f, g + (g1 - g) * f, b + (b1 - b) * f, a + (a1 - a) * f, s + (s1 - s) * f
-    return r, g, b, a, s
-
-
-# ------------------------------------------------------------------------------------------------ lookup
+# ------------------------------------------------------------------------------------------------ volumes
 
 
 @inlined
@@ -216,109 +162,73 @@ def influence(table, k, p, n, d):  # type: ignore[no-untyped-def]
     return w * table.weight[k]
 
 
-@inlined
-def probe_light(table, k, p, d, lod, environment, sky_follows):  # type: ignore[no-untyped-def]
-    """Colour of probe `k` for a ray, the share of it that is not sky, and how far the proxy's guess can be trusted.
+# ------------------------------------------------------------------------------------------------ lookup
 
-    The colour is already weighted by that share. `sky_follows`: a later tier will add the sky.
+
+@inlined
+def cube_at(table, k, d, lod):  # type: ignore[no-untyped-def]
+    """Trilinear (r, g, b, coverage, distance) of cube `k` in a direction, which need not be unit."""
+    face, x, y = direction_face(d)
+    return level_at(table.texels, table.first[k], table.side[k], table.last[k], face, x, y, lod)
+
+
+@inlined
+def _cube_roughness(table, k, blur, roughness, hdrp, s, far):  # type: ignore[no-untyped-def]
+    """Perceptual roughness of the lobe that the cube shall be looked up with.
+
+    The cone of half angle atan(`blur`) is blur s wide where it meets the proxy, and the capture sees that from `far`
+    away: nothing has to be guessed about distance. HDRP's own way takes the material's roughness as it is, or lowered
+    by its distance-based roughness (LightEvaluation.hlsl).
+    """
+    if not hdrp:
+        return math.sqrt(min(1.0, 0.5 * blur * s / max(far, 1e-9)))
+    if table.sharp_near[k] == 0 or table.proxy_kind[k] == 2:
+        return roughness
+    lowered = min(roughness, s / max(far, 1e-9) * roughness)
+    return lowered + (roughness - lowered) * roughness
+
+
+@inlined
+def probe_light(table, k, p, d, blur, roughness, hdrp, environment, sky_follows):  # type: ignore[no-untyped-def]
+    """What probe `k` shows to a ray from `p` along unit `d`.
+
+    Args:
+        blur: tangent of the half angle of the ray's cone.
+        roughness: perceptual, for HDRP's mapping, which `hdrp` asks for.
+        sky_follows: a later tier will add the sky.
+
+    Returns:
+        (colour already weighted by coverage, coverage: the share of it that is not sky, factor on the probe's weight,
+        confidence: how far the proxy's guess of the distance can be trusted)
     """
     s = proxy_distance(table, k, p, d)
-    to = sub(along(p, d, s), row(table.capture, k))
-    r, g, b, coverage, seen = cube_at(table, k, to, lod)
-    far = length(to)
+    meets = along(p, d, s)
+    if table.planar[k] != 0:
+        eye, m, e = table.eye[k], table.influence[k], row(table.influence_extents, k)
+        local = transform_point(m, meets)
+        face, x, y, far, width = window_of(eye, local, e, s * blur)
+        fits = 0.0
+        if face >= 0:
+            fits = window_weight(eye, transform_point(m, p), face, e, x, y)
+        if fits <= 0.0:
+            return (0.0, 0.0, 0.0), 1.0, 0.0, 0.0
+        texels = width / _AVERAGE_MEDIAN * table.side[k, 0]
+        lod = 0.5 * math.log2(1.0 + texels * texels)
+        r, g, b, coverage, seen = level_at(table.texels, table.first[k], table.side[k], table.last[k], face, x, y, lod)
+        sky, gloss = d, math.sqrt(min(1.0, 0.5 * blur))
+    else:
+        fits = 1.0
+        sky = sub(meets, row(table.capture, k))
+        far = length(sky)
+        gloss = _cube_roughness(table, k, blur, roughness, hdrp, s, far)
+        r, g, b, coverage, seen = cube_at(table, k, sky, probe_lod_hdrp(gloss))
     confidence = 0.0
     if seen > 0.0 and far > 0.0:
         confidence = min(seen, far) / max(seen, far)
-    color = (r, g, b)
     if coverage < 1.0 and not sky_follows:
         if environment.present:
-            sky = radiance(environment, normalize(to), 0.0)
+            light = prefiltered(environment, sky, gloss)
             left = 1.0 - coverage
-            color = (r + sky[0] * left, g + sky[1] * left, b + sky[2] * left)
+            r, g, b = r + light[0] * left, g + light[1] * left, b + light[2] * left
         coverage = 1.0
-    return scale(color, table.multiplier[k]), coverage, confidence
-
-
-# ------------------------------------------------------------------------------------------------ capture
-
-
-@kernel
-def capture_rows(world, table, scratch, k, face, y0, y1, mask, near, far, samples):  # type: ignore[no-untyped-def]
-    """Draw rows y0 .. y1 (multiples of 4, border included) of one face of probe `k`. Returns rays traced."""
-    packet, block, second, limit = scratch.packet, scratch.block, scratch.second, scratch.far
-    packet.tally[0] = 0
-    res = table.resolution[k]
-    stride = res + 2
-    centre = row(table.capture, k)
-    for by in range(y0, y1, BLOCK_HEIGHT):
-        for bx in range(0, stride, BLOCK_WIDTH):
-            for sample in range(samples):
-                clear(packet)
-                for lane in range(LANES):
-                    x, y = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
-                    if x >= stride or y >= stride:
-                        continue
-                    block.pixel[lane, 0], block.pixel[lane, 1] = x + stride * face, y + 4099 * (k + 1)
-                    d = face_direction(face, (x - 0.5) / res * 2.0 - 1.0, (y - 0.5) / res * 2.0 - 1.0)
-                    stretch = length(d)
-                    limit[lane] = far * stretch
-                    set_ray(packet, lane, centre, scale(d, 1.0 / stretch), near * stretch, limit[lane], mask)
-                intersect_world(packet, world, limit, COHERENT)
-                load_hits(block, packet, world, 2.0 / res)
-                shade(block, second, packet, world, sample, mask)
-                _keep_texels(table, k, face, bx, by, block, 1.0 / samples)
-    return packet.tally[0]
-
-
-@inlined
-def _keep_texels(table, k, face, bx, by, block, share):  # type: ignore[no-untyped-def]
-    stride = table.resolution[k] + 2
-    for lane in range(LANES):
-        x, y = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
-        if x >= stride or y >= stride or block.on[lane] == 0:
-            continue
-        i = table.first[k, 0] + ((face * stride + y) * stride + x) * TEXEL
-        for c in range(3):
-            table.texels[i + c] += block.color[lane, c] * share
-        table.texels[i + 3] += share
-        table.texels[i + 4] += block.distance[lane] * share
-
-
-@kernel
-def fill_levels(table, k):  # type: ignore[no-untyped-def]
-    """Make the levels of probe `k` from level 0: 2x2 averages, borders looked up across the edge."""
-    level = 1
-    while level < table.first.shape[1] and table.first[k, level] >= 0:
-        res, stride = table.resolution[k] >> level, (table.resolution[k] >> level) + 2
-        above = table.first[k, level - 1]
-        wide = (table.resolution[k] >> (level - 1)) + 2
-        for face in range(6):
-            for y in range(res):
-                for x in range(res):
-                    i = table.first[k, level] + ((face * stride + y + 1) * stride + x + 1) * TEXEL
-                    j = above + ((face * wide + 2 * y + 1) * wide + 2 * x + 1) * TEXEL
-                    for c in range(TEXEL):
-                        t = table.texels
-                        below = j + wide * TEXEL
-                        t[i + c] = 0.25 * (t[j + c] + t[j + TEXEL + c] + t[below + c] + t[below + TEXEL + c])
-        _fill_border(table, k, level, res)
-        level += 1
-
-
-@inlined
-def _fill_border(table, k, level, res):  # type: ignore[no-untyped-def]
-    """Border texels of a level: the nearest inner texel of the neighbouring face."""
-    stride = res + 2
-    for face in range(6):
-        for y in range(stride):
-            for x in range(stride):
-                if 0 < x < stride - 1 and 0 < y < stride - 1:
-                    continue
-                d = face_direction(face, (x - 0.5) / res * 2.0 - 1.0, (y - 0.5) / res * 2.0 - 1.0)
-                other, u, v = direction_face(d)
-                ix = min(max(int((u + 1.0) * 0.5 * res), 0), res - 1) + 1
-                iy = min(max(int((v + 1.0) * 0.5 * res), 0), res - 1) + 1
-                i = table.first[k, level] + ((face * stride + y) * stride + x) * TEXEL
-                j = table.first[k, level] + ((other * stride + iy) * stride + ix) * TEXEL
-                for c in range(TEXEL):
-                    table.texels[i + c] = table.texels[j + c]
+    return scale((r, g, b), table.multiplier[k]), coverage, fits, confidence

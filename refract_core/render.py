@@ -8,25 +8,29 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor, wait
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import capture, environment, textures
+from . import environment, textures
 from .camera import View, image_size, view_of
+from .capture import cubemap_of, fill_table
 from .embree import Bvh
 from .errors import Cancelled, UsageError
 from .frame import Frame
 from .gbuffer import OpaqueLayer, RefractiveLayer, new_refractive_layer, opaque_tile, peel_tile
 from .kernel import is_compiled
 from .lights import pack_lights
+from .plan import Plan, plan_capture, plan_picture
 from .planes import Planes, add_tile, by_name, finish_of, finish_tile, new_planes
 from .pointer import Pointer
+from .probes import empty_table
 from .pyramid import Screen, ScreenBuffers, blur_level, fill_depth_levels, new_screen_buffers
 from .refraction import Choices, LayerResult, new_layer_result, put_tile, refract_tile
 from .sampling import pixel_offset
-from .scene import Camera, Model, Notice, Param, Scene
+from .scene import Camera, Cubemap, Model, Notice, Param, Probe, Scene
 from .scratch import scratch
 from .settings import TIERS, RenderSettings
 from .tables import pack_geometry, pack_materials
@@ -48,8 +52,10 @@ class Work(NamedTuple):
     progress: Progress
     cancel: Cancel
 
-    def run(self, function: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
-        """Map in order; stop early and raise Cancelled when asked to."""
+    def run(
+        self, function: Callable[[Any], Any], items: Sequence[Any], told: Callable[[float], None] | None = None
+    ) -> list[Any]:
+        """Map in order; stop early and raise Cancelled when asked to. `told`: hears now and then what share is done."""
         if self.cancel():
             raise Cancelled("cancelled; nothing was written")
         futures = [self.executor.submit(function, item) for item in items]
@@ -57,6 +63,8 @@ class Work(NamedTuple):
         try:
             while pending:
                 _, pending = wait(pending, timeout=0.2)
+                if told:
+                    told(1.0 - len(pending) / len(futures))
                 if self.cancel():
                     raise Cancelled("cancelled; nothing was written")
         except BaseException:
@@ -75,6 +83,7 @@ class Session(NamedTuple):
     probes: Pointer
     thing_probe: NDArray[np.int32]
     rays: int
+    notices: tuple[Notice, ...]
 
 
 def render(
@@ -123,7 +132,8 @@ def render(
         "refract:metersPerUnit": scene.metres_per_unit,
         "refract:rays": float(rays + session.rays),
     }
-    return Frame(width, height, planes, metadata, scene.notices + open_meshes(scene, settings.model))
+    notices = scene.notices + open_meshes(scene, settings.model) + session.notices
+    return Frame(width, height, planes, metadata, notices)
 
 
 def open_meshes(scene: Scene, model: str) -> tuple[Notice, ...]:
@@ -148,8 +158,18 @@ def choose_camera(scene: Scene, name: str) -> Camera:
 
 def prepare(scene: Scene, camera: Camera, settings: RenderSettings, height: int, work: Work) -> Session:
     """Pack tables, build the BVH, capture probes."""
-    plan = capture.plan(scene, height, wanted="probe" in settings.tiers or settings.screen == "proxy")
-    geometry, bvh, slots = pack_geometry(scene, plan.captured_sets)
+    wanted = "probe" in settings.tiers or settings.screen == "proxy"
+    chosen = plan_picture(scene, camera, height, wanted)
+    if "probe" not in settings.tiers:  # their proxies may still serve the screen tier
+        chosen = chosen._replace(entries=[entry._replace(drawn=False) for entry in chosen.entries])
+    samples = min(settings.samples, _PROBE_SAMPLES)
+    return _prepare(scene, camera, chosen, _is_rough(scene), samples, work, (0.1, 0.2))
+
+
+def _prepare(
+    scene: Scene, camera: Camera, chosen: Plan, rough: bool, samples: int, work: Work, span: tuple[float, float]
+) -> Session:
+    geometry, bvh, slots = pack_geometry(scene, chosen.captured_sets)
     world = Pointer(
         world_of(
             geometry,
@@ -159,11 +179,52 @@ def prepare(scene: Scene, camera: Camera, settings: RenderSettings, height: int,
             environment.pack(scene.environment),
         )
     )
-    if "probe" not in settings.tiers:  # their proxies may still serve the screen tier
-        plan = plan._replace(entries=[entry._replace(drawn=False) for entry in plan.entries])
-    work.progress(0.1, "probes")
-    table, rays = capture.capture(plan, world, camera, work.run, min(settings.samples, _PROBE_SAMPLES))
-    return Session(world, bvh, Pointer(table), plan.thing_probe, rays)
+    entries = chosen.entries
+    table = empty_table([e.probe for e in entries], [e.owned for e in entries], camera, rough)
+
+    def run(function: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
+        return work.run(
+            function, items, lambda share: work.progress(span[0] + (span[1] - span[0]) * share, "probes")
+        )
+
+    work.progress(span[0], "probes")
+    rays = fill_table(table, entries, world, run, samples)
+    return Session(world, bvh, Pointer(table), chosen.thing_probe, rays, chosen.notices)
+
+
+def capture_probes(
+    scene: Scene,
+    probes: Sequence[Probe],
+    *,
+    samples: int = 16,
+    jobs: int = 0,
+    progress: Progress | None = None,
+    cancel: Cancel | None = None,
+    executor: Executor | None = None,
+) -> list[Cubemap]:
+    """Take the pictures of cube probes, with all their levels, as `refract bake probes` does.
+
+    Args:
+        probes: of the scene, or made by hand; what they have for a `cubemap` is ignored. None may be planar.
+        samples: rays per texel, 1 .. 4096.
+        jobs: threads; 0 means all cores.
+
+    Raises:
+        UsageError: a probe is planar: its picture depends on the camera.
+        Cancelled: `cancel` said so.
+    """
+    for probe in probes:
+        if probe.planar:
+            raise UsageError(f"{probe.path}: a planar probe's picture depends on the camera; leave it to the render")
+    own = ThreadPoolExecutor(jobs or os.cpu_count() or 1) if executor is None else None
+    try:
+        work = Work(executor or own, progress or (lambda _f, _s: None), cancel or (lambda: False))  # type: ignore[arg-type]
+        chosen = plan_capture(scene, [replace(probe, cubemap=None) for probe in probes])
+        session = _prepare(scene, choose_camera(scene, ""), chosen, True, samples, work, (0.0, 1.0))
+    finally:
+        if own is not None:
+            own.shutdown()
+    return [cubemap_of(session.probes.record, k) for k in range(len(probes))]
 
 
 def tiles_of(width: int, height: int, side: int) -> list[Tile]:

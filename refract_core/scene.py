@@ -229,9 +229,46 @@ class Volume:
     """box: half size [m]; sphere: (radius, radius, radius) [m]"""
 
 
+CUBE_LEVELS = 7
+"""Levels of a prefiltered cubemap: 0 is the capture, 1 .. 6 are blurred by GGX lobes (HDRP, IBLFilterGGX.cs)."""
+
+
+@dataclass(frozen=True)
+class Cubemap:
+    """What is seen from one point in all directions, prefiltered or not.
+
+    Faces +x -x +y -y +z -z of engine world (Y up, never turned with the probe), row 0 on top, each as OpenGL has it: at
+    column i of n, with x = (i + 0.5) / n * 2 - 1, and y alike, +x looks along (1, -y, -x), -x along (-1, -y, x), +y
+    along (x, 1, y), -y along (x, -1, -y), +z along (x, -y, 1), -z along (-x, -y, -1).
+    """
+
+    levels: tuple[F32, ...]
+    """Level m: shape (6, n, n, 5) with n = max(1, resolution >> m): red, green, blue (premultiplied by coverage),
+    coverage (0 where the sky is seen), distance [m] (0 where it is not known). CUBE_LEVELS of them, or just level 0."""
+
+    @property
+    def resolution(self) -> int:
+        return int(self.levels[0].shape[1])
+
+
+@dataclass(frozen=True)
+class Bake:
+    """What a baked texture was made from, as written down beside it."""
+
+    digest: str
+    """`refract_core.digest.probe_digest` of the scene at `time_code`"""
+    engine: str
+    """version of refract"""
+    time_code: float
+
+
 @dataclass(frozen=True)
 class Probe:
-    """A reflection probe: where it stands, what it sees, where it serves."""
+    """A reflection probe: where it stands, what it sees, where it serves.
+
+    A planar probe takes two pictures through its own xy plane as through a window: the mirrored eye's, for what it
+    reflects, and the eye's own, for what lies behind it. The window is the influence volume's extent along x and y.
+    """
 
     path: str
     mode: str
@@ -244,8 +281,15 @@ class Probe:
     resolution: int = 128
     clipping: tuple[float, float] = (0.1, 1000.0)
     """[m]"""
-    texture: Texture | None = None
-    """The baked or given cubemap; None means capture at render time."""
+    cubemap: Cubemap | None = None
+    """The baked or given picture; None means capture at render time."""
+    bake: Bake | None = None
+    """None where the picture does not say what it was made from."""
+    planar: bool = False
+    background: tuple[float, float, float] | None = None
+    """Radiance where nothing is met; None lets the sky through."""
+    distance_roughness: bool = False
+    """Under `--screen proxy`: lower the roughness of what is near (HDRP, LightEvaluation.hlsl)."""
     captured: tuple[str, ...] | None = None
     """Paths of the prims it sees (the `captured` collection); None means everything."""
     blend_distance: tuple[float, ...] = (0.0,) * 6

@@ -19,6 +19,9 @@ SCREEN_FADE = 0.1
 _MAX_STEPS = 384
 _FACING = 1e-3  # cosine below which a surface is seen too edge-on to be hit
 _BEHIND = 1.001  # ratio of depths beyond which a ray counts as behind a surface
+_LEVEL_MEDIAN = 1.92
+"""Median radius of the colour pyramid's blur, in pixels of a level. Its variance is 8/3 (4^level - 1) pixels^2, from a
+binomial filter of 2 texels^2 on each level, and half of a round Gaussian lies within 1.177 deviations."""
 _SLACK = 1.0  # how far outside its pixel a plane may be met, in pixels' worth of the ray
 
 
@@ -156,8 +159,8 @@ def screen_march(screen, origin, direction, blur):  # type: ignore[no-untyped-de
     """Colour and weight of the march.
 
     Args:
-        blur: tangent of the half angle of the rough cone; the pyramid level is chosen so that a texel is as wide as
-            the cone at the hit.
+        blur: tangent of the half angle of the rough cone; the pyramid level is chosen so that half of its blur falls
+            within the cone at the hit.
 
     Returns:
         (colour, weight 0 .. 1, confidence 0 .. 1)
@@ -171,7 +174,8 @@ def screen_march(screen, origin, direction, blur):  # type: ignore[no-untyped-de
     lod = 0.0
     if blur > 0.0:
         _, _, z = project(screen.camera, along(origin, direction, s))
-        lod = math.log2(max(1.0, 2.0 * blur * s / pixel_width(screen.camera, max(z, 1e-6))))
+        radius = blur * s / pixel_width(screen.camera, max(z, 1e-6)) / _LEVEL_MEDIAN
+        lod = 0.5 * math.log2(1.0 + radius * radius)
     if lod > 0.0:
         return color_at(screen, px, py, lod), w, 1.0
     return _on_surface(screen, px, py, origin, direction, s), w, 1.0

@@ -12,10 +12,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .embree import LANES, OPAQUE, SCATTERED, clear, set_ray
-from .environment import radiance
+from .environment import prefiltered
 from .kernel import inlined
-from .optics_scalar import probe_lod_hdrp, screen_lod_hdrp
+from .optics_scalar import screen_lod_hdrp
 from .probes import influence, probe_light, proxy_distance
+from .reach import next_of, piece_of
 from .sampling import unit_pair
 from .screen import screen_march, screen_proxy
 from .shading import load_hits, shade
@@ -115,7 +116,8 @@ def ask(query, order, hdrp, screen, probes, thing_probe, z_self, block, second, 
             elif tier == PROBE:
                 _ask_probes(query, lane, hdrp, probes, thing_probe, world, sky_follows)
             elif tier == SKY and world.environment.present:
-                light = radiance(world.environment, row(query.direction, lane), 2.0 * query.blur[lane])
+                gloss = query.roughness[lane] if hdrp else math.sqrt(min(1.0, 0.5 * query.blur[lane]))
+                light = prefiltered(world.environment, row(query.direction, lane), gloss)
                 _add(query, lane, SKY, light, _headroom(query, lane), 1.0)
 
 
@@ -138,31 +140,37 @@ def _ask_screen(query, lane, hdrp, screen, probes, thing_probe, z_self, block): 
 
 @inlined
 def _ask_probes(query, lane, hdrp, probes, thing_probe, world, sky_follows):  # type: ignore[no-untyped-def]
+    """Every probe that reaches the ray's origin, in order; then the one that is the thing's own."""
+    p = row(query.origin, lane)
+    cuts, sets = probes.reach.cuts, probes.reach.sets
+    i, j, l = piece_of(cuts, 0, p[0]), piece_of(cuts, 1, p[1]), piece_of(cuts, 2, p[2])  # noqa: E741
+    k = next_of(sets, i, j, l, 0)
+    while k >= 0 and _headroom(query, lane) > 1.0 - _SPENT:
+        _ask_probe(query, lane, k, hdrp, probes, world, sky_follows)
+        k = next_of(sets, i, j, l, k + 1)
+    own = thing_probe[query.thing[lane]]
+    if own >= 0 and probes.owned[own] != 0 and _headroom(query, lane) > 1.0 - _SPENT:
+        _ask_probe(query, lane, own, hdrp, probes, world, sky_follows)
+
+
+@inlined
+def _ask_probe(query, lane, k, hdrp, probes, world, sky_follows):  # type: ignore[no-untyped-def]
     origin, direction, n = row(query.origin, lane), row(query.direction, lane), row(query.normal, lane)
-    for k in range(probes.owned.shape[0]):
-        if _headroom(query, lane) <= 1.0 - _SPENT:
-            break
-        if probes.owned[k] != 0 and thing_probe[query.thing[lane]] != k:
-            continue
-        w = influence(probes, k, origin, n, direction)
-        if w <= 0.0:
-            continue
-        if hdrp:
-            lod = probe_lod_hdrp(query.roughness[lane])
-        else:
-            lod = math.log2(max(1.0, query.blur[lane] * probes.resolution[k]))
-        light, coverage, confidence = probe_light(
-            probes, k, origin, direction, lod, world.environment, sky_follows and world.environment.present
-        )
-        spent = 1.0 - _headroom(query, lane)
-        # The colour carries its own coverage; only the covered share of the weight is used up.
-        _, w = update_headroom(spent, w)
-        for c in range(3):
-            query.color[lane, c] += light[c] * w
-        w *= coverage
-        query.weight[lane, PROBE] += w
-        query.weight[lane, NONE] -= w
-        query.confidence[lane] += w * confidence
+    w = influence(probes, k, origin, n, direction)
+    if w <= 0.0:
+        return
+    light, coverage, fits, confidence = probe_light(
+        probes, k, origin, direction, query.blur[lane], query.roughness[lane], hdrp, world.environment,
+        sky_follows and world.environment.present,
+    )  # fmt: skip
+    # The colour carries its own coverage; only the covered share of the weight is used up.
+    _, w = update_headroom(1.0 - _headroom(query, lane), w * fits)
+    for c in range(3):
+        query.color[lane, c] += light[c] * w
+    w *= coverage
+    query.weight[lane, PROBE] += w
+    query.weight[lane, NONE] -= w
+    query.confidence[lane] += w * confidence
 
 
 @inlined

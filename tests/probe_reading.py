@@ -6,7 +6,8 @@ import numpy as np
 from pxr import Usd
 
 from refract_core.errors import ImageError
-from refract_core.scene import F64, Notice, Probe, Texture
+from refract_core.scene import F64, Cubemap, Notice, Probe
+from refract_core.usd.probe_pictures import ReadCubemap
 from refract_core.usd.probes import read_probes
 
 # Z-up stage to Y-up engine: +X stays, +Z becomes +Y.
@@ -20,10 +21,11 @@ def to_engine(metres: float = 1.0, turn: F64 = Y_UP, centre: tuple[float, float,
     return turn @ np.diag([metres, metres, metres, 1.0]) @ move
 
 
-def texture(path: str, color_space: str) -> Texture:
+def cubemap(path: str, resolution: int) -> Cubemap:
+    """A file that holds nothing but the length of its own path."""
     if "missing" in path:
         raise ImageError(f"{path} does not exist")
-    return Texture(f"{path} {color_space}", np.zeros((1, 1, 4), np.uint8))
+    return Cubemap((np.full((6, resolution, resolution, 5), len(path), np.float32),))
 
 
 def open_text(text: str) -> Usd.Stage:
@@ -34,7 +36,11 @@ def open_text(text: str) -> Usd.Stage:
 
 
 def read(
-    text: str, engine_from_stage: F64 | None = None, metres: float = 1.0, time: float = 0.0
+    text: str,
+    engine_from_stage: F64 | None = None,
+    metres: float = 1.0,
+    time: float = 0.0,
+    read_cubemap: ReadCubemap = cubemap,
 ) -> tuple[tuple[Probe, ...], list[Notice]]:
     notices: list[Notice] = []
     matrix = to_engine(metres) if engine_from_stage is None else engine_from_stage
@@ -44,16 +50,27 @@ def read(
         engine_from_stage=matrix,
         metres_per_unit=metres,
         notices=notices,
-        read_texture=texture,
+        read_cubemap=read_cubemap,
     )
     return found, notices
 
 
-def probe(body: str = "") -> str:
-    return f'def RefractProbe "P"\n{{\n{body}\n}}\n'
+def probe(body: str = "", *, name: str = "P", kind: str = "RefractProbe", data: str = "") -> str:
+    """Text of one probe prim. `data`: what its customData holds."""
+    above = f"(customData = {{\n{data}\n}}\n)" if data else ""
+    return f'def {kind} "{name}" {above}\n{{\n{body}\n}}\n'
 
 
-def read_one(body: str = "", metres: float = 1.0) -> tuple[Probe, list[str]]:
-    (found,), notices = read(probe(body), metres=metres)
+def planar(body: str = "") -> str:
+    return probe(body, kind="RefractPlanarProbe")
+
+
+def read_one(body: str = "", metres: float = 1.0, data: str = "") -> tuple[Probe, list[str]]:
+    return read_only(probe(body, data=data), metres)
+
+
+def read_only(text: str, metres: float = 1.0) -> tuple[Probe, list[str]]:
+    """The one probe of a text, whose path is /P, and what was said about it."""
+    (found,), notices = read(text, metres=metres)
     assert {notice.path for notice in notices} <= {"/P"}
     return found, [notice.text for notice in notices]

@@ -22,7 +22,7 @@ ROOMS = {
     "embreex": ("refract_core.embree",),
     "ctypes": ("refract_core.embree", "service"),
     "llvmlite": ("refract_core.embree", "refract_core.kernel", "refract_core.pointer"),
-    "OpenImageIO": ("refract_core.image",),
+    "OpenImageIO": ("refract_core.image", "refract_core.image_files", "refract_core.image_cubemaps"),
     "fastapi": ("service",),
     "starlette": ("service",),
     "uvicorn": ("service",),

@@ -29,6 +29,7 @@ class Said(NamedTuple):
 ERRORS = {
     "not_usd": Said("", ("cannot be read as .usd, .usda, .usdc or .usdz",)),
     "unknown_model": Said(MATERIAL, ("refraction:model", "banana", "none, sphere, box, thin, traced")),
+    "unknown_probe_clear": Said("/World/Probe", ("probe:clear", "fog", "sky, color")),
     "unknown_probe_mode": Said("/World/Probe", ("probe:mode", "sometimes", "baked, realtime, custom")),
 }
 WARNINGS = {
@@ -46,6 +47,8 @@ WARNINGS = {
     "no_faces_left": Said("/World/Quad", ("skipped", "none of its 2 faces")),
     "no_unit": Said("", ("metersPerUnit is 0", "above 0")),
     "nothing_visible": Said("/", ("nothing is visible", "empty")),
+    "planar_probe_texture": Said("/World/Probe", ("planar", "every picture", "probe:texture is ignored")),
+    "probe_background_negative": Said("/World/Probe", ("probe:backgroundColor", "-0.5", "0 or more")),
     "thickness_zero": Said(MATERIAL, ("inputs:refraction:thickness", "is 0;", "clamped")),
     "transmittance_above_one": Said(MATERIAL, ("transmittanceColor", "1.5", "0 to 1")),
     "unknown_shader": Said(MATERIAL, ("NoSuchShader", "UsdPreviewSurface")),

@@ -54,6 +54,8 @@ TABLE = (
     Attribute(PROBE, "probe:resolution", "int", 128, minimum=8, maximum=4096, uniform=True),
     Attribute(PROBE, "probe:clippingRange", "float2", pytest.approx((0.1, 1000)), minimum=(0, 0)),
     Attribute(PROBE, "probe:captureOffset", "float3", (0, 0, 0)),
+    Attribute(PROBE, "probe:clear", "token", "sky", ("sky", "color"), uniform=True),
+    Attribute(PROBE, "probe:backgroundColor", "color3f", (0, 0, 0), minimum=(0, 0, 0)),
     Attribute(PROBE, "probe:shape", "token", "box", ("box", "sphere"), uniform=True),
     Attribute(PROBE, "probe:influence:size", "float3", (10, 10, 10), minimum=(0, 0, 0)),
     Attribute(PROBE, "probe:influence:radius", "float", 3.0, minimum=0.0),
@@ -66,6 +68,7 @@ TABLE = (
     Attribute(PROBE, "probe:importance", "int", 1, minimum=0, maximum=32767),
     Attribute(PROBE, "probe:weight", "float", 1.0, minimum=0.0, maximum=1.0),
     Attribute(PROBE, "probe:multiplier", "float", 1.0, minimum=0.0),
+    Attribute(PROBE, "probe:distanceBasedRoughness", "bool", False, uniform=True),
     Attribute(PROBE, "probe:fadeDistance", "float", 10000.0, minimum=0.0),
     Attribute(PROBE, "collection:captured:includeRoot", "bool", True, uniform=True),
     Attribute(SETTINGS, "refract:samples", "int", 4, minimum=1, maximum=4096, uniform=True),
@@ -140,6 +143,25 @@ def test_typed_probes_are_placed_and_carry_the_probe_attributes(stage: Usd.Stage
     assert Usd.SchemaRegistry().FindConcretePrimDefinition(name).GetDocumentation()
     stage.WriteFallbackPrimTypes()
     assert list(stage.GetRootLayer().pseudoRoot.GetInfo("fallbackPrimTypes")[name]) == ["Xform"]
+
+
+@pytest.mark.parametrize(("name", "importance"), [("RefractProbe", 1), ("RefractPlanarProbe", 64)])
+def test_planar_probes_come_first_as_in_hdrp(stage: Usd.Stage, name: str, importance: int) -> None:
+    attribute = stage.DefinePrim("/Probe", name).GetAttribute("probe:importance")
+    definition = Usd.SchemaRegistry().FindConcretePrimDefinition(name)
+    assert attribute.Get() == definition.GetAttributeFallbackValue("probe:importance") == importance
+    assert (attribute.GetHardLimits().GetMinimum(), attribute.GetHardLimits().GetMaximum()) == (0, 32767)
+    assert "Range: 0 to 32767. Unit: none." in attribute.GetDocumentation()
+    assert attribute.GetDisplayGroup() == "Blending"
+
+
+def test_planar_probes_differ_from_the_others_in_their_mode_and_importance(stage: Usd.Stage) -> None:
+    plain, planar = (Usd.SchemaRegistry().FindConcretePrimDefinition(name) for name in schemas.TYPED)
+    assert plain.GetPropertyNames() == planar.GetPropertyNames()
+    assert plain.GetAppliedAPISchemas() == planar.GetAppliedAPISchemas()
+    own = [name for name in plain.GetPropertyNames() if name.startswith("probe:") and name != "probe:proxy:prim"]
+    differing = [n for n in own if plain.GetAttributeFallbackValue(n) != planar.GetAttributeFallbackValue(n)]
+    assert sorted(differing) == ["probe:importance", "probe:mode"]
 
 
 def test_a_probe_sees_everything_unless_its_collection_says_otherwise(stage: Usd.Stage) -> None:
@@ -254,6 +276,36 @@ def test_found_through_plugin_path_without_our_python(tmp_path: Path) -> None:
 
 def test_unknown_without_any_of_the_ways(tmp_path: Path) -> None:
     assert "Cannot find a valid schema" in run(USE, tmp_path).stderr
+
+
+LOOK = """
+from pxr import Sdf, Usd, UsdGeom
+stage = Usd.Stage.Open("probes.usda")
+assert Usd.SchemaRegistry().FindAppliedAPIPrimDefinition("RefractProbeAPI") is None
+for prim in stage.GetPseudoRoot().GetChildren():
+    known = prim.GetPrimTypeInfo().GetSchemaTypeName()
+    child = UsdGeom.Imageable(prim.GetChild("Ball")).ComputeLocalToWorldTransform(0).ExtractTranslation()
+    weight = prim.GetAttribute("probe:weight").Get()
+    print(prim.GetTypeName(), known, prim.IsA(UsdGeom.Xformable), child[0], weight)
+"""
+
+
+@pytest.mark.parametrize(("fallback", "known"), [(True, "Xform True"), (False, " False")])
+def test_stages_with_probes_open_where_the_schemas_are_unknown(tmp_path: Path, fallback: bool, known: str) -> None:
+    """The probes are Xforms there by `fallbackPrimTypes`, prims without a type where it is missing."""
+    stage = Usd.Stage.CreateNew(str(tmp_path / "probes.usda"))
+    for name in schemas.TYPED:
+        prim = stage.DefinePrim(f"/{name}", name)
+        prim.GetAttribute("probe:weight").Set(0.5)
+        UsdGeom.Xformable(prim).AddTranslateOp().Set((3, 0, 0))
+        UsdGeom.Sphere.Define(stage, f"/{name}/Ball")
+    if fallback:
+        stage.WriteFallbackPrimTypes()
+    stage.Save()
+    done = run(LOOK, tmp_path)
+    assert done.stderr == ""
+    moved = "3.0" if fallback else "0.0"
+    assert done.stdout.splitlines() == [f"{name} {known} {moved} 0.5" for name in schemas.TYPED]
 
 
 def test_registering_after_a_stage_was_opened_says_what_to_do(tmp_path: Path) -> None:

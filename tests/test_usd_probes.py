@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from probe_reading import Y_UP, Z_UP, probe, read, read_one, to_engine
+from probe_reading import Y_UP, Z_UP, planar, probe, read, read_one, read_only, to_engine
 
 from refract_core.scene import F64, Probe
 
@@ -17,7 +17,9 @@ def test_schema_fallbacks_become_metres() -> None:
     found, notices = read_one(metres=0.01)
     assert notices == []
     assert found.path == "/P"
-    assert (found.mode, found.resolution, found.texture, found.captured) == ("baked", 128, None, None)
+    assert (found.mode, found.resolution, found.captured) == ("baked", 128, None)
+    assert (found.cubemap, found.bake, found.background) == (None, None, None)
+    assert (found.planar, found.distance_roughness) == (False, False)
     assert found.influence.extents == pytest.approx((0.05, 0.05, 0.05))
     assert found.clipping == pytest.approx((0.001, 10.0))
     assert found.fade_distance == pytest.approx(100.0)
@@ -178,7 +180,6 @@ def test_hidden_probes_are_skipped_in_silence() -> None:
 @pytest.mark.parametrize(
     ("text", "path", "word"),
     [
-        ('def RefractPlanarProbe "P" {}', "/P", "planar probes are not rendered yet"),
         ('def Scope "P" (prepend apiSchemas = ["RefractProbeAPI"]) {}', "/P", "has no transform"),
         ('def PointInstancer "I" { def RefractProbe "P" {} }', "/I/P", "point instancer /I"),
     ],
@@ -201,6 +202,66 @@ def test_probes_in_native_instances_are_read_in_place() -> None:
     )
     found, _ = read(text)
     assert [(probe.path, probe.capture_point[0]) for probe in found] == [("/I1/P", 1.0), ("/I2/P", 2.0)]
+
+
+# ---- planar probes
+
+
+def test_planar_probe_has_the_values_of_any_other_but_its_mode_and_importance() -> None:
+    found, notices = read_only(planar(), metres=0.01)
+    plain, _ = read_one(metres=0.01)
+    assert notices == []
+    assert found.planar
+    assert (found.mode, found.importance) == ("realtime", 64)  # HDRP's defaults for planar probes
+    for name in ("capture_point", "clipping", "blend_distance", "weight", "fade_distance", "background"):
+        assert getattr(found, name) == getattr(plain, name)
+    assert found.influence.extents == plain.influence.extents
+
+
+@pytest.mark.parametrize("turn", [Y_UP, Z_UP])
+@pytest.mark.parametrize("mirror", ["(1, 1, 1)", "(-1, 1, 1)"])
+def test_window_of_a_planar_probe_lies_in_its_own_xy_plane(turn: F64, mirror: str) -> None:
+    body = placed(
+        f"double3 xformOp:translate = (10, 20, 30)\ndouble xformOp:rotateX = -90\nfloat3 xformOp:scale = {mirror}",
+        '"xformOp:translate", "xformOp:rotateX", "xformOp:scale"',
+        "float[] probe:influence:blendDistance = [0.5, 0.25, 0, 0, 0, 0]",
+    )
+    matrix = to_engine(0.1, turn)
+    (found,), notices = read(planar(body), matrix, 0.1)
+    assert notices == []
+    frame = found.influence.world_from_volume
+    assert frame[:3, 3] == pytest.approx((matrix @ (10, 20, 30, 1))[:3])
+    # The quarter turn about X takes the plane's +Z to +Y of the stage.
+    assert frame[:3, 2] == pytest.approx(matrix[:3, 1] / 0.1, abs=1e-9)
+    assert found.influence.extents == pytest.approx((0.1, 0.2, 0.3))
+    assert sorted(found.blend_distance) == pytest.approx([0, 0, 0, 0, 0.025, 0.05])
+
+
+@pytest.mark.parametrize(
+    ("authored", "field", "used"),
+    [
+        ("float[] probe:influence:blendNormalDistance = [0, 0, 1, 0, 0, 0]", "blend_normal_distance", (0.0,) * 6),
+        ("float[] probe:influence:faceFade = [1, 1, 0.5, 1, 1, 1]", "face_fade", (1.0,) * 6),
+        ("float3 probe:captureOffset = (0, 1, 0)", "capture_point", (0.0,) * 3),
+        ("uniform bool probe:distanceBasedRoughness = 1", "distance_roughness", False),
+    ],
+)
+def test_what_a_planar_probe_does_not_have_is_told(authored: str, field: str, used: object) -> None:
+    found, notices = read_only(planar(authored))
+    assert getattr(found, field) == used
+    name = authored.split(" = ")[0].split()[-1]
+    assert [text.startswith(f"{name} is ") and "ignored" in text and "Remove it" in text for text in notices] == [True]
+
+
+def test_what_a_planar_probe_would_do_anyway_may_be_authored() -> None:
+    body = (
+        "float[] probe:influence:blendNormalDistance = [0, 0, 0, 0, 0, 0]\n"
+        "float[] probe:influence:faceFade = [1, 1, 1, 1, 1, 1]\nfloat3 probe:captureOffset = (0, 0, 0)\n"
+        "uniform bool probe:distanceBasedRoughness = 0\nint probe:importance = 3"
+    )
+    found, notices = read_only(planar(body))
+    assert notices == []
+    assert found.importance == 3
 
 
 # ---- what it sees

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -22,10 +22,13 @@ from .geometry import Shape, read_shape
 from .lights import read_lights
 from .parts import Bound, Part, Tables, assemble, bind
 from .place import Placed, bounds_of, place, to_mesh, to_sphere
+from .probe_pictures import read_cubemap
 from .probes import read_probes
 from .skel import posed
-from .textures import read_texture
 from .traverse import Placement, some_of, walk
+
+Keep = Callable[[list[Placement], Tables], list[Placement]]
+"""Some of what is drawn."""
 
 FALLBACK_METRES_PER_UNIT = 0.01
 _WARNINGS = 20
@@ -48,7 +51,7 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
         raise StageError(f"{name or 'the stage path'}: there is no such file; check the path")
     if file.is_dir():
         raise StageError(f"{name}: is a folder; name a .usd, .usda, .usdc or .usdz file in it")
-    with _captured() as heard:
+    with captured() as heard:
         try:
             stage = Usd.Stage.Open(name)
         except Tf.ErrorException as error:
@@ -57,7 +60,7 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
     if stage is None:
         reason = " ".join(heard[0].split()) if heard else "USD gives no reason"
         raise StageError(f"{name}: cannot be read as .usd, .usda, .usdc or .usdz: {reason}")
-    with _captured():
+    with captured():
         for layer in stage.GetUsedLayers():  # USD keeps layers in memory; a changed file would show its old content
             if not layer.anonymous and not layer.dirty:
                 layer.Reload()
@@ -96,17 +99,22 @@ def scene_from_stage(
     time_code: float | None = None,
     purposes: tuple[str, ...] = ("default", "render"),
     camera: str = "",
+    keep: Keep | None = None,
 ) -> Scene:
-    """Reads an opened stage at one time; see `load_stage`. The stage is not changed."""
+    """Reads an opened stage at one time; see `load_stage`. The stage is not changed.
+
+    Args:
+        keep: which of the drawn prims are read at all; None reads every one
+    """
     if time_code is not None and not math.isfinite(time_code):
         raise UsageError(f"time_code is {time_code}; it must be a finite number")
     time = Usd.TimeCode(time_range(stage)[0] if time_code is None else time_code)
     notices = _composition_notices(stage)
-    with _captured():  # composing again repeats the same warnings
+    with captured():  # composing again repeats the same warnings
         stage = posed(stage, time, notices)
-    with _captured() as heard:
+    with captured() as heard:
         try:
-            scene = _read(stage, time, purposes, camera, notices)
+            scene = _read(stage, time, purposes, camera, notices, keep)
         except Tf.ErrorException as error:
             reason = " ".join(str(error.args[0].commentary).split())
             raise StageError(f"{stage.GetRootLayer().identifier}: USD cannot read it: {reason}") from error
@@ -116,7 +124,7 @@ def scene_from_stage(
 
 
 @contextmanager
-def _captured() -> Iterator[list[str]]:
+def captured() -> Iterator[list[str]]:
     """Takes USD's warnings away from stderr; they are in the list once the block is left."""
     delegate = UsdUtils.CoalescingDiagnosticDelegate()
     heard: list[str] = []
@@ -138,11 +146,15 @@ def _composition_notices(stage: Usd.Stage) -> list[Notice]:
     return found
 
 
-def _read(stage: Usd.Stage, time: Usd.TimeCode, purposes: tuple[str, ...], camera: str, notices: list[Notice]) -> Scene:
-    metres_per_unit = _metres_per_unit(stage, notices)
+def _read(
+    stage: Usd.Stage, time: Usd.TimeCode, purposes: tuple[str, ...], camera: str, notices: list[Notice],
+    keep: Keep | None,
+) -> Scene:  # fmt: skip
+    metres_per_unit = stage_unit(stage, notices)
     metres_from_stage = _upright(stage, notices) @ np.diag([metres_per_unit] * 3 + [1.0])
     tables = Tables(time, metres_per_unit, notices)
-    placed = _placed(walk(stage, time, purposes, notices), metres_from_stage, tables)
+    drawn = walk(stage, time, purposes, notices)
+    placed = _placed(keep(drawn, tables) if keep else drawn, metres_from_stage, tables)
     extent = bounds_of(placed)
     if extent is None:
         notices.append(Notice("/", "nothing is visible at this time and with these purposes; the scene is empty"))
@@ -168,7 +180,7 @@ def _read(stage: Usd.Stage, time: Usd.TimeCode, purposes: tuple[str, ...], camer
         environment=environment,
         camera_light=not _has_light(stage),
         cameras=cameras,
-        probes=read_probes(stage, time, read_texture=read_texture, **frame),
+        probes=read_probes(stage, time, read_cubemap=read_cubemap, **frame),
         bounds=bounds,
         stage_from_engine=np.linalg.inv(engine_from_stage).astype(np.float64),
         metres_per_unit=metres_per_unit,
@@ -199,7 +211,8 @@ def _has_light(stage: Usd.Stage) -> bool:
     return any(prim.HasAPI(UsdLux.LightAPI) for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
 
 
-def _metres_per_unit(stage: Usd.Stage, notices: list[Notice]) -> float:
+def stage_unit(stage: Usd.Stage, notices: list[Notice]) -> float:
+    """Metres per scene unit; USD's fallback, with a notice, where what is authored is no length."""
     if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
         return FALLBACK_METRES_PER_UNIT
     authored = float(stage.GetMetadata(UsdGeom.Tokens.metersPerUnit))  # unlike UsdGeom's call, takes any number type
