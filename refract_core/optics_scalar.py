@@ -245,12 +245,14 @@ def thin_wall(f: float, a: float) -> tuple[float, float]:
 def transmitted_roughness(roughness: float, ior: float, two_interfaces: bool) -> float:
     """Perceptual roughness of the reflection lobe that is as wide as the transmitted one.
 
-    Fitted to a GGX Monte Carlo at normal incidence (microfacet model of Walter et al. 2007, median angle):
-    alpha_t = alpha (1 - 1 / n) / 2 behind one rough interface, about 0.83 (n - 1) alpha behind two; alpha is
-    roughness squared. Never more than 1.
+    Fitted to a GGX Monte Carlo at normal incidence (microfacet model of Walter et al. 2007, median angle; it is
+    `benchmarks/lobe.py`): alpha_t = alpha (1 - 1 / n) / 2 behind one rough interface, and behind two
+    0.835 (n - 1) alpha / (1 + 2.5 (n - 1) alpha^2), for masking and total reflection narrow wide lobes; alpha is
+    roughness squared. At n = 1.5 within 1 % up to roughness 0.7. Never more than 1.
     """
     n = max(ior, 1.0)
-    factor = 0.83 * (n - 1.0) if two_interfaces else 0.5 * (1.0 - 1.0 / n)
+    alpha = roughness * roughness
+    factor = 0.835 * (n - 1.0) / (1.0 + 2.5 * (n - 1.0) * alpha * alpha) if two_interfaces else 0.5 * (1.0 - 1.0 / n)
     return min(roughness * math.sqrt(factor), 1.0)
 
 

@@ -107,7 +107,10 @@ def test_thin_wall_loses_nothing_when_clear() -> None:
 
 def test_transmitted_lobe_is_the_measured_width() -> None:
     assert optics_scalar.transmitted_roughness(1.0, 1.5, False) == pytest.approx(0.408, abs=1e-3)
-    assert optics_scalar.transmitted_roughness(1.0, 1.5, True) == pytest.approx(0.645, abs=1e-3)
+    # alpha_t / alpha behind two interfaces of n = 1.5, from the Monte Carlo of benchmarks/lobe.py
+    for roughness, ratio in ((0.1, 0.4178), (0.3, 0.4136), (0.5, 0.3872), (0.7, 0.3216)):
+        found = (optics_scalar.transmitted_roughness(roughness, 1.5, True) / roughness) ** 2
+        assert found == pytest.approx(ratio, rel=0.01)
     for two in (False, True):
         assert optics_scalar.transmitted_roughness(0.7, 1.0, two) == 0.0
         assert optics_scalar.transmitted_roughness(1.0, 4.0, two) <= 1.0

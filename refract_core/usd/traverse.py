@@ -105,6 +105,9 @@ def _descend(
         if prim.IsPseudoRoot():
             stack.extend(_Node(child, *node[1:]) for child in reversed(prim.GetFilteredChildren(predicate)))
             continue
+        if prim.HasAuthoredTypeName() and not prim.IsA(UsdGeom.Imageable):  # materials and the like: nothing to ask
+            stack.extend(_Node(child, *node[1:]) for child in reversed(prim.GetFilteredChildren(predicate)))
+            continue
         if prim.GetAttribute("visibility").Get(state.time) == UsdGeom.Tokens.invisible:
             continue
         here = _enter(state, node, moves=not (placed and node is start))
