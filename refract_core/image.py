@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from .aovs import AOVS, check_names, shape_of
 from .errors import ImageError, UsageError
-from .image_cubemaps import read_cubemap, write_cubemap
+from .image_cubemaps import read_cubemap, read_notes, write_cubemap
 from .image_files import HALF_MAX, MAX_TEXTURE_PIXELS, encoded, extension_of, named_file, read_pixels, reason, replacing
 from .scene import F32, Texture
 from .srgb import srgb_decode, srgb_encode
@@ -28,9 +28,11 @@ __all__ = [
     "default_aovs",
     "display",
     "read_cubemap",
+    "read_notes",
     "read_texture",
     "write_cubemap",
     "write_frame",
+    "write_map",
 ]
 
 COLOR_SPACES = ("auto", "raw", "sRGB")
@@ -152,6 +154,32 @@ def write_frame(
         ((name, plane),) = planes.items()
         pixels, spec = _eight_bit(path, name, plane, metadata, color_correction)
     data = encoded(path, pixels, spec)
+    with replacing(path) as temporary:
+        Path(temporary).write_bytes(data)
+
+
+def write_map(path: str, plane: F32, metadata: Mapping[str, str | float]) -> None:
+    """Write one number per texel as half floats in the one channel Y of an .exr, in one step. Equal input, equal bytes.
+
+    Args:
+        plane: shape (H, W), row 0 on top.
+        metadata: attributes of the file.
+
+    Raises:
+        UsageError: not an .exr file.
+        ImageError: the file cannot be written.
+    """
+    import OpenImageIO as oiio
+
+    if _extension(path) not in LAYERED:
+        raise UsageError(f"{path}: a map is written as .exr; change the extension")
+    spec = oiio.ImageSpec(plane.shape[1], plane.shape[0], 1, "half")
+    spec.channelnames = ("Y",)
+    spec.attribute("compression", "zip")
+    spec.attribute("DateTime", "")
+    for key, value in metadata.items():
+        spec.attribute(key, value)
+    data = encoded(path, np.ascontiguousarray(np.clip(plane, -HALF_MAX, HALF_MAX))[..., None], spec)
     with replacing(path) as temporary:
         Path(temporary).write_bytes(data)
 

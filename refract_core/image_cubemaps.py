@@ -27,7 +27,8 @@ from .srgb import srgb_decode
 
 CHANNELS = ("R", "G", "B", "A", "Z")
 _FORMATS = ("half", "half", "half", "half", "float")
-_LAYOUT, _RESOLUTION, _LEVELS = "refract:layout", "refract:resolution", "refract:levels"
+_OURS = "refract:"
+_LAYOUT, _RESOLUTION, _LEVELS = f"{_OURS}layout", f"{_OURS}resolution", f"{_OURS}levels"
 _TILE = 64
 
 
@@ -41,7 +42,7 @@ def write_cubemap(
 
     Args:
         layout: one of `cubemaps.LAYOUTS`.
-        metadata: more attributes of the file.
+        metadata: more attributes of the file; `read_notes` gives back those that begin with `refract:`.
 
     Raises:
         UsageError: an unknown layout, or not an .exr file.
@@ -175,6 +176,23 @@ def read_cubemap(source: str | bytes, name: str, resolution: int) -> Cubemap:
     if picture.straight:
         texels[..., :3] *= texels[..., 3:4]
     return Cubemap((_faces(texels, name, resolution),))
+
+
+def read_notes(source: str | bytes, name: str) -> dict[str, str | int | float]:
+    """What `write_cubemap` wrote beside the pixels: attributes that begin with `refract:`, without that.
+
+    Raises:
+        ImageError: not a readable image.
+    """
+    import OpenImageIO as oiio
+
+    with named_file(source, name) as path:
+        file = oiio.ImageInput.open(path)
+        if file is None:
+            raise ImageError(f"{name}: not a readable image: {reason(oiio.geterror(), path)}")
+        attributes: dict[str, Any] = {str(one.name): one.value for one in file.spec().extra_attribs}
+        file.close()
+    return {key.removeprefix(_OURS): value for key, value in attributes.items() if key.startswith(_OURS)}
 
 
 def _finite(texels: F32) -> F32:

@@ -10,7 +10,7 @@ from typing import Any
 
 from .errors import Cancelled, UsageError
 from .progress import Report
-from .scene import Notice
+from .scene import Notice, Scene
 from .settings import RenderSettings
 
 COMPLEXITIES = ("low", "medium", "high", "veryhigh")
@@ -89,6 +89,8 @@ def _render_jobs(order: Order, jobs: Sequence[Any], report: Report, cancel: Call
         _stop_if(cancel)
         scene = scene_from_stage(stage, time_code=job.time_code, purposes=settings.purposes, camera=settings.camera)
         tell(scene.notices)
+        if done == 0:
+            tell(_stale(stage, scene, settings))
         _stop_if(cancel)
         frame = render(scene, settings, progress=_part(report, done, len(jobs)), cancel=cancel)
         tell(frame.notices)
@@ -97,6 +99,21 @@ def _render_jobs(order: Order, jobs: Sequence[Any], report: Report, cancel: Call
         seconds = time.perf_counter() - started
         size = os.path.getsize(job.path)
         report.done(job.path, f"{frame.width} x {frame.height}, {_bytes(size)}, {seconds:.1f} s")
+
+
+def _stale(stage: Any, scene: Scene, settings: RenderSettings) -> list[Notice]:
+    """Baked probes that no longer show what is there; each is asked about the time it was baked at."""
+    if not any(probe.bake for probe in scene.probes):
+        return []
+    from .bake import stale_bakes
+    from .usd.stage import scene_from_stage
+
+    def scene_at(time_code: float) -> Scene:
+        if time_code == scene.time_code and settings.purposes == RenderSettings().purposes:
+            return scene
+        return scene_from_stage(stage, time_code=time_code)
+
+    return stale_bakes(scene.probes, scene_at)
 
 
 def _settings(authored: Mapping[str, object], overrides: Mapping[str, object]) -> RenderSettings:

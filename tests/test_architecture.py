@@ -23,6 +23,8 @@ ROOMS = {
     "ctypes": ("refract_core.embree", "service"),
     "llvmlite": ("refract_core.embree", "refract_core.kernel", "refract_core.pointer"),
     "OpenImageIO": ("refract_core.image", "refract_core.image_files", "refract_core.image_cubemaps"),
+    "pygltflib": ("refract_core.gltf",),
+    "flip_evaluator": ("refract_core.compare",),
     "fastapi": ("service",),
     "starlette": ("service",),
     "uvicorn": ("service",),

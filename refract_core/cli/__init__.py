@@ -5,7 +5,15 @@ from __future__ import annotations
 import os
 import sys
 
-from . import render  # noqa: F401  a command is known once its module is loaded
+from . import (  # noqa: F401  a command is known once its module is loaded
+    bake,
+    bake_thickness,
+    convert,
+    inspect,
+    node,
+    render,
+    validate,
+)
 from .app import CANCELLED, app
 
 __all__ = ["app", "main"]

@@ -1,7 +1,7 @@
 """UsdShade materials as rows of the material table: the bound surface shader, then RefractMaterialAPI over it.
 
 Where a material has both, the MaterialX surface (outputs:mtlx:surface) wins over the universal one if every node
-of it is understood.
+of it is understood; a single renderer's own surface (`vendors`) is looked at where neither is.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from ..settings import MODELS
 from .glass import READERS
 from .sources import Context, constant, is_constant, node_name, note, producer, read_number, read_source, scaled
 from .surfaces import DEFAULTS, Surface, clamped, display_color_inputs, lowest, read_preview_surface
+from .vendors import CONTEXTS, vendor_id
+from .vendors import READERS as VENDOR_READERS
 
 API = "RefractMaterialAPI"
 THIN_THICKNESS = 0.005
@@ -48,8 +50,8 @@ def read_material(
         StageError: `refraction:model` is not a known token.
     """
     context = Context(str(material.GetPath()), time, textures, notices, [])
-    surface = _surface(context, material, metres_per_unit)
-    if _has_api(material.GetPrim()):
+    surface, _ = read_surface(context, material, metres_per_unit)
+    if has_api(material.GetPrim()):
         return _refraction(context, material, surface, metres_per_unit)
     row = _row(context.path, surface, metres_per_unit)
     if not surface.glass:
@@ -89,7 +91,7 @@ def _thickness_of(value: Source, factor: float) -> Source:
     return scaled(replace(value, primvar=THICKNESS_PRIMVAR), factor)
 
 
-def _has_api(prim: Usd.Prim) -> bool:
+def has_api(prim: Usd.Prim) -> bool:
     """RefractMaterialAPI is applied, also where the schema is not registered."""
     return API in prim.GetAppliedSchemas() or API in prim.GetPrimTypeInfo().GetAppliedAPISchemas()
 
@@ -97,14 +99,14 @@ def _has_api(prim: Usd.Prim) -> bool:
 # --- the surface shader ---------------------------------------------------------------------------------------------
 
 
-def _surface(context: Context, material: UsdShade.Material, unit: float) -> Surface:
-    """The MaterialX surface if it is fully understood, else the universal one, else displayColor."""
+def read_surface(context: Context, material: UsdShade.Material, unit: float) -> tuple[Surface, UsdShade.Shader | None]:
+    """The MaterialX surface if it is fully understood, else the universal one, else displayColor (and no shader)."""
     found: list[UsdShade.Shader] = []
     for render_context in ("mtlx", ""):
         shader = material.ComputeSurfaceSource(render_context)[0]
         if shader and shader.GetPath() not in [known.GetPath() for known in found]:
             found.append(shader)
-    known = [shader for shader in found if _is_known(shader)]
+    known = [shader for shader in found if _is_known(shader)] or vendor_surfaces(material)
     for position, shader in enumerate(known):
         trial = context._replace(textures=dict(context.textures), notices=list(context.notices), unsupported=[])
         surface = _read_shader(trial, shader, unit)
@@ -112,18 +114,27 @@ def _surface(context: Context, material: UsdShade.Material, unit: float) -> Surf
             for key in list(trial.textures)[len(context.textures) :]:
                 context.textures[key] = trial.textures[key]
             context.notices.extend(trial.notices[len(context.notices) :])
-            return surface
+            return surface, shader
         note(context, f"{node_name(shader)} needs nodes that are not supported ({', '.join(trial.unsupported)}); "
              f"{node_name(known[position + 1])} of the same material is used")  # fmt: skip
-    return _unknown_surface(context, material, found)
+    return _unknown_surface(context, material, found), None
 
 
 def _is_known(shader: UsdShade.Shader) -> bool:
     return shader.GetShaderId() in _PREVIEW or shader.GetShaderId() in READERS
 
 
+def vendor_surfaces(material: UsdShade.Material) -> list[UsdShade.Shader]:
+    """The first surface that is written for one renderer and understood, if there is one."""
+    for context in CONTEXTS:
+        shader = material.ComputeSurfaceSource(context)[0]
+        if shader and vendor_id(shader):
+            return [shader]
+    return []
+
+
 def _read_shader(context: Context, shader: UsdShade.Shader, unit: float) -> Surface:
-    reader = READERS.get(shader.GetShaderId())
+    reader = READERS.get(shader.GetShaderId()) or VENDOR_READERS.get(vendor_id(shader))
     return reader(context, shader, unit) if reader else read_preview_surface(context, shader)
 
 
@@ -136,7 +147,7 @@ def _unknown_surface(context: Context, material: UsdShade.Material, found: list[
         what = f"{', '.join(others)} leads to no surface shader this renderer reads"
     else:
         what = "has no surface shader"
-    if _has_api(material.GetPrim()):
+    if has_api(material.GetPrim()):
         if found or others:
             note(context, f"{what}; roughness 0 and opacity 0 are used")
         return Surface(inputs=display_color_inputs(has_opacity=False) | {Param.ROUGHNESS: constant(0.0)})
@@ -148,16 +159,31 @@ def _shader_glass(context: Context, row: Material, surface: Surface, *, thin: bo
     """Glass that its surface shader alone describes: thin-walled or open, else traced through the real mesh.
 
     A transmission colour without a distance (OpenPBR: depth 0) tints the surface once. The thin model reaches that
-    colour after exactly its own 5 mm; a solid reaches it after one scene unit, the schema's default distance.
+    colour after exactly its own 5 mm; a solid reaches it after one scene unit, the schema's default distance. The thin
+    model has no other distance, so a colour with one is taken to 5 mm (Beer-Lambert).
     """
     if thin:
-        distance = surface.absorption_distance or THIN_THICKNESS
-        return _with(row, {Param.THICKNESS: constant(THIN_THICKNESS)}, model=Model.THIN, absorption_distance=distance)
+        color = _thin_color(context, row.inputs[Param.TRANSMITTANCE], surface.absorption_distance)
+        changes = {Param.THICKNESS: constant(THIN_THICKNESS), Param.TRANSMITTANCE: color}
+        return _with(row, changes, model=Model.THIN, absorption_distance=THIN_THICKNESS)
     tint = row.inputs[Param.TRANSMITTANCE]
     if surface.absorption_distance is None and tint != constant(DEFAULTS[Param.TRANSMITTANCE]):
         note(context, "has a transmission colour without a depth, which tints a surface; "
              "it is read as the colour left after one scene unit; author a depth")  # fmt: skip
     return _with(row, {}, model=Model.TRACED, absorption_distance=surface.absorption_distance or unit)
+
+
+def _thin_color(context: Context, color: Source, distance: float | None) -> Source:
+    """What is left after 5 mm of a medium that leaves `color` after `distance` [m]."""
+    if distance is None or color == constant(DEFAULTS[Param.TRANSMITTANCE]):
+        return color
+    if not is_constant(color):
+        note(context, f"its transmission colour is mapped, so it is read as left after {THIN_THICKNESS} m, "
+             "the thin model's own distance")  # fmt: skip
+        return color
+    r, g, b, a = color.value
+    power = THIN_THICKNESS / distance
+    return replace(color, value=(r**power, g**power, b**power, a))
 
 
 # --- RefractMaterialAPI ---------------------------------------------------------------------------------------------

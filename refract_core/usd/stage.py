@@ -146,6 +146,13 @@ def _composition_notices(stage: Usd.Stage) -> list[Notice]:
     return found
 
 
+def _origin(low: F64, high: F64) -> F64:
+    """The scene's centre on a grid of up to a quarter of its size [m]: what moves a little moves no origin, so frames
+    of a sequence share it, and what a probe was baked from stays the same to the bit."""
+    step = 2.0 ** math.ceil(math.log2(max(float((high - low).max()), 1e-6) / 8.0))
+    return np.asarray(np.round((low + high) / (2.0 * step)) * step)
+
+
 def _read(
     stage: Usd.Stage, time: Usd.TimeCode, purposes: tuple[str, ...], camera: str, notices: list[Notice],
     keep: Keep | None,
@@ -159,7 +166,7 @@ def _read(
     if extent is None:
         notices.append(Notice("/", "nothing is visible at this time and with these purposes; the scene is empty"))
         extent = -np.ones(3), np.ones(3)
-    centre = (extent[0] + extent[1]) / 2
+    centre = _origin(*extent)
     meshes, spheres = _drawn(placed, centre)
     engine_from_stage = metres_from_stage.copy()
     engine_from_stage[:3, 3] = -centre

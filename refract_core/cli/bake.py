@@ -1,0 +1,80 @@
+"""`refract bake`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from ..bake import BakeOrder, bake_probes
+from .app import Jobs, ProgressMode, app, outcome, words
+
+bake = typer.Typer(help="Work something out once and keep it in a layer over the stage.", no_args_is_help=True)
+app.add_typer(bake, name="bake", rich_help_panel=None)
+
+Stage = Annotated[str, typer.Argument(metavar="STAGE", help="The .usd, .usda, .usdc or .usdz file. It is not changed.")]
+Out = Annotated[
+    str,
+    typer.Argument(
+        metavar="OUT",
+        help="The layer over STAGE to write. Textures go into the folder OUT.probes beside it (OUT without its "
+        "extension), or into OUT itself where that is a .usdz.",
+    ),
+]
+Only = Annotated[
+    str,
+    typer.Option(
+        metavar="PATH,...", help="Only these probes, or those below these paths; * and ? stand for any characters."
+    ),
+]
+Resolution = Annotated[
+    int | None, typer.Option(help="Texels on a side of each face, 8 to 4096, instead of each probe's own.")
+]
+Layout = Annotated[
+    str,
+    typer.Option(metavar="strip|cross|latlong", help="How the faces lie in the file. A strip is read back exactly."),
+]
+Samples = Annotated[int, typer.Option(help="Rays per texel, 1 to 4096.")]
+Force = Annotated[bool, typer.Option("--force", help="Bake all, also what is up to date.")]
+SkipExisting = Annotated[
+    bool, typer.Option("--skip-existing", help="Leave textures that exist as they are, up to date or not.")
+]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace OUT even if it is not an earlier bake of the same stage.")
+]
+
+
+@bake.command("probes")
+def bake_probes_command(
+    stage: Stage,
+    out: Out,
+    only: Only = "",
+    resolution: Resolution = None,
+    layout: Layout = "strip",
+    samples: Samples = 16,
+    force: Force = False,
+    skip_existing: SkipExisting = False,
+    overwrite: Overwrite = False,
+    jobs: Jobs = None,
+    progress: ProgressMode = "auto",
+) -> None:
+    """Bake reflection probes to EXR cubemaps, and write a layer over STAGE that uses them.
+
+    Probes of mode baked are baked; realtime, custom and planar ones are named and left alone. What is up to date is
+    kept: the scene it shows, its settings and the version of refract are the same. Run again after a change, or to go
+    on after an interruption.
+    """
+    order = BakeOrder(
+        stage=stage,
+        out=out,
+        only=words(only),
+        resolution=resolution,
+        layout=layout,
+        samples=samples,
+        jobs=jobs or 0,
+        force=force,
+        skip_existing=skip_existing,
+        overwrite=overwrite,
+    )
+    with outcome(progress) as (report, cancel):
+        bake_probes(order, report, cancel)
