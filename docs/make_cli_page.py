@@ -33,15 +33,13 @@ def page() -> str:
 
 
 def _contexts(context: click.Context) -> Iterator[click.Context]:
-    """A command and everything below it."""
+    """A command and everything below it, by name."""
     yield context
-    if isinstance(context.command, click.Group):
-        for name in context.command.list_commands(context):
-            inner = context.command.get_command(context, name)
-            if inner is not None and not inner.hidden:
-                yield from _contexts(
-                    click.Context(inner, context, info_name=name, max_content_width=_WIDTH, terminal_width=_WIDTH)
-                )
+    for name, inner in sorted(getattr(context.command, "commands", {}).items()):
+        if not inner.hidden:
+            yield from _contexts(
+                click.Context(inner, context, info_name=name, max_content_width=_WIDTH, terminal_width=_WIDTH)
+            )
 
 
 if __name__ == "__main__":

@@ -99,7 +99,8 @@ def bake_thickness(order: ThicknessOrder, report: Report, cancel: Callable[[], b
         _tell(report, found, work, lost_bindings(layer, bound))
         _write_pictures(work.pictures)
         save(layer, order.out)
-    report.done(order.out, f"{len(work.rows)} prims measured along {order.along}, {len(work.left) + len(work.fixed)} left alone")
+    left = len(work.left) + len(work.fixed)
+    report.done(order.out, f"{len(work.rows)} prims measured along {order.along}, {left} left alone")
     return tuple(work.rows)
 
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import fnmatch
-import importlib
-import importlib.util
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from statistics import median
@@ -115,7 +113,6 @@ def convert(
     from .usd import convert as usd
     from .usd import convert_shapes, convert_to, write
 
-    measure = _measuring() if order.thickness == "measured" else None
     write.check_out(order.stage, order.out, overwrite=order.overwrite)
     progress(0.0, "opening")
     with _folder_for_pictures(order.out) as folder:
@@ -128,8 +125,11 @@ def convert(
         _go_on(cancel)
         progress(0.8, "writing")
         usd.add(work.layer, [addition for plan in plans for addition in plan.additions])
-        if measure is not None:
-            measure(work.layer, [path for plan in plans for path in plan.sized])
+        left: tuple[Notice, ...] = ()
+        if order.thickness == "measured":
+            from .bake_thickness import bake_over
+
+            left = bake_over(work.layer, [path for plan in plans for path in plan.sized], cancel=cancel)
         _write_pictures(pictures)
         rows = [plan.row for plan in plans]
         if order.to:
@@ -137,7 +137,7 @@ def convert(
             told = convert_to.write_surfaces(work.layer, order.to, within_reach)
             rows = [replace(row, notes=(*row.notes, *told.get(row.path, ()))) for row in rows]
         write.save(work.layer, order.out)
-    return Converted(tuple(rows), work.notices)
+    return Converted(tuple(rows), (*work.notices, *left))
 
 
 def _look(order: ConvertOrder, pictures: str) -> tuple[Work, list[Glass], dict[str, bytes]]:
@@ -184,18 +184,6 @@ def _write_pictures(pictures: dict[str, bytes]) -> None:
             os.replace(f"{path}.part", path)
         except OSError as error:
             raise StageError(f"{path}: cannot be written: {error.strerror}; choose another place for OUT") from error
-
-
-def _measuring() -> Callable[[Any, Sequence[str]], None]:
-    """`thickness.bake_over(layer, prims)`: authors the measured thickness of prims in a layer over their stage.
-
-    Raises:
-        UsageError: there is no such thing yet.
-    """
-    if importlib.util.find_spec(f"{__package__}.thickness") is None:
-        raise UsageError("--thickness measured needs `refract bake thickness`, which is not built yet; use typed")
-    found: Callable[[Any, Sequence[str]], None] = importlib.import_module(".thickness", __package__).bake_over
-    return found
 
 
 def _go_on(cancel: Callable[[], bool]) -> None:
@@ -271,7 +259,7 @@ def _model(glass: Glass, uses: list[Use], forced: str) -> tuple[Model, str, list
     best = together(fits)
     opened = [use.path for use in uses if not all(fit.closed for fit in use.fits)]
     if best.model is Model.TRACED and opened:
-        notes.append(f"light that enters the open {opened[0]} finds no way out; give it a material of its own")
+        notes.append(f"{opened[0]} is open, so it is drawn as 'thin'; give it a material of its own to say so")
     return best.model, best.why, notes
 
 

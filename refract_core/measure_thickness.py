@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 _UNEVEN = 0.05
 """Relative spread over which a prim that carries one value is told to vary."""
+_OUT_OF_REACH = "it lies in an instance of another file, out of a layer's reach; make the instance not instanceable"
 
 
 class How(NamedTuple):
@@ -78,22 +79,11 @@ def measure_all(
             work.fixed.append(candidate.path)
             continue
         candidate = replace(candidate, coats=coats)
-        body = _unreachable(candidate, how) or read_body(candidate, found.time, wants_uv=bool(how.texture))
+        body = _OUT_OF_REACH if not candidate.edit else read_body(candidate, found.time, wants_uv=bool(how.texture))
         why = body if isinstance(body, str) else _one(candidate, body, found, how, files, work)
         if why:
             work.left.append(Notice(candidate.path, f"left alone: {why}"))
     return work
-
-
-def _unreachable(candidate: Candidate, how: How) -> str:
-    if not candidate.edit:
-        return "it lies in an instance of another file, out of a layer's reach; make the instance not instanceable"
-    for coat in candidate.coats if how.texture else ():
-        if not coat.applied:
-            return "its material has no RefractMaterialAPI to connect a picture to; run refract convert first"
-        if not (coat.edit and coat.bound):
-            return "its material lies in an instance, out of a layer's reach; leave out --texture"
-    return ""
 
 
 def _one(candidate: Candidate, body: Body, found: Found, how: How, files: dict[str, str], work: Work) -> str:
@@ -111,7 +101,7 @@ def _one(candidate: Candidate, body: Body, found: Found, how: How, files: dict[s
         work.coats.update({coat.material: coat for coat in candidate.coats if coat.mapped})
         work.rows.append(_row(candidate, flat, kind, notes))
         return ""
-    picture = _picture(candidate, body, how, notes)
+    picture = _no_material(candidate) or _picture(candidate, body, how, notes)
     if isinstance(picture, str):
         return picture
     file, most, mean = files[candidate.path], float(picture.max()), float(picture.mean())
@@ -197,6 +187,16 @@ def _is_tiled(body: Body) -> bool:
     from .thickness_map import is_tiled
 
     return body.uv is not None and is_tiled(body.uv)
+
+
+def _no_material(candidate: Candidate) -> str:
+    """Why there is no material that a picture could be connected to; '' where there is one."""
+    for coat in candidate.coats:
+        if not coat.applied:
+            return "its material has no RefractMaterialAPI to connect a picture to; run refract convert first"
+        if not (coat.edit and coat.bound):
+            return "its material lies in an instance, out of a layer's reach; leave out --texture"
+    return ""
 
 
 def _picture(

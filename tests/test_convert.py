@@ -315,10 +315,13 @@ def test_plain_usd_core_opens_it_and_finds_nothing_wrong(tmp_path: Path, name: s
     assert plain(out) == ["sphere 0.6"]
 
 
-def test_measured_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
-    with pytest.raises(UsageError, match="bake thickness"):
-        run(several(tmp_path), tmp_path / "out.usda", thickness="measured")
+def test_measured_thickness_is_what_the_geometry_says(tmp_path: Path) -> None:
+    """A ball of radius 0.3 is 0.6 thick along every normal."""
+    out = tmp_path / "out.usda"
+    run(several(tmp_path), out, thickness="measured")
+    scene = load_stage(str(out))
+    (ball_read,) = scene.spheres
+    assert ball_read.primvars["refraction:thickness"].ravel() == pytest.approx(0.6, rel=0.02)
 
 
 def test_the_command_prints_a_table_or_json(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((RO
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 # What a page may ask a reader to type that `.ci/run` and the benchmarks do, not these tests.
 _ELSEWHERE = ("pip install", "pytest", ".ci/run", "python -m benchmarks.", "python docs/", "python -m schemas.generate")
-_SMALL = ["--image-width", "32", "--samples", "1"]
+_SMALL = {"render": ["--image-width", "32", "--samples", "1"], "bake probes": ["--samples", "1"]}
 
 
 class Block(NamedTuple):
@@ -80,13 +80,13 @@ def commands(text: str) -> list[str]:
 
 @pytest.mark.parametrize("block", list(blocks("sh")), ids=name)
 def test_a_shell_block_runs(block: Block, desk: Path) -> None:
-    """`refract` commands run as they stand, renders of a small picture."""
+    """`refract` commands run as they stand, pictures small and quick."""
     for line in commands(block.text):
         if line.startswith(_ELSEWHERE):
             continue
         words = shlex.split(re.sub(r"\s# .*", "", line))
         assert words[0] == "refract", f"{block.page}: '{line}' is not run by anything"
-        small = _SMALL if words[1] == "render" else []
+        small = _SMALL.get(words[1], _SMALL.get(" ".join(words[1:3]), []))
         done = CliRunner().invoke(app, [*words[1:], *small])
         assert done.exit_code == 0, f"{line}\n{done.output}"
 

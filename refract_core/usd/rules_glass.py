@@ -208,7 +208,7 @@ def _shape(piece: Glass) -> Iterator[Finding]:
         fix = f"set refraction:model to 'box', or {convert}"
         yield _finding(FLAT_SPHERE, piece.path, text, fix, "refraction:model")
     elif piece.model is Model.TRACED and not piece.closed:
-        text = f"the traced model of {piece.row.name} is on an open mesh, so rays find no way out of it"
+        text = f"the traced model of {piece.row.name} is on an open mesh, which has no far side; it is drawn as 'thin'"
         yield _finding(TRACED_OPEN, piece.path, text, "close the mesh, or set refraction:model to 'thin'")
 
 

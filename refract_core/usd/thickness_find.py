@@ -98,6 +98,8 @@ class Found:
     """Prims that each glass material is on, by its path"""
     notices: tuple[Notice, ...]
     time: Usd.TimeCode
+    drawn: Usd.Stage
+    """The stage in the pose of that time; prims live as long as it does"""
 
 
 # --- which prims ----------------------------------------------------------------------------------------------------
@@ -114,9 +116,10 @@ def find(stage: Usd.Stage) -> Found:
     unit = stage_unit(stage, notices)
     glass = {original(stage.GetPrimAtPath(found.path)): found for found in find_glass(stage, time, unit)}
     if not glass:
-        return Found((), {}, tuple(notices), time)
+        return Found((), {}, tuple(notices), time, stage)
     drawn: dict[Sdf.Path, list[Placement]] = defaultdict(list)
-    for placement in walk(posed(stage, time, notices), time, PURPOSES, notices):
+    in_pose = posed(stage, time, notices)
+    for placement in walk(in_pose, time, PURPOSES, notices):
         drawn[placement.prim.GetPath()].append(placement)
     prims = [placements[0].prim for placements in drawn.values()]
     rows = _Rows(time, unit, notices)
@@ -133,7 +136,7 @@ def find(stage: Usd.Stage) -> Found:
             groups[edit or str(original(at_stage))].append(Candidate((str(prim.GetPath()),), edit, prim, places, coats))
     candidates = tuple(_merged(group) for group in groups.values())
     frozen = {path: frozenset(users) for path, users in bound_to.items()}
-    return Found(candidates, frozen, tuple(dict.fromkeys(notices)), time)
+    return Found(candidates, frozen, tuple(dict.fromkeys(notices)), time, in_pose)
 
 
 def stage_of(layer: Sdf.Layer) -> Usd.Stage:
@@ -240,15 +243,20 @@ def read_body(candidate: Candidate, time: Usd.TimeCode, *, wants_uv: bool) -> Bo
         radius=_uniform_scale(linear[0]) if shape.is_sphere else 0.0,
         uv=uv,
         uv_name=uv_name,
-        notes=(*_notes(shape), *(notice.text for notice in notices)),
+        notes=(*_notes(shape, candidate.prim), *(notice.text for notice in notices)),
     )
 
 
-def _notes(shape: Shape) -> Iterable[str]:
+def _notes(shape: Shape, prim: Usd.Prim) -> Iterable[str]:
     if shape.cage:
         yield "measured on the control cage of the subdivision surface, which is what is drawn"
-    if shape.varying:
+    if shape.varying or any(above.GetTypeName() == "SkelRoot" for above in _above(prim)):
         yield "its geometry changes in time; measured at the first time of the stage"
+
+
+def _above(prim: Usd.Prim) -> Iterator[Usd.Prim]:
+    while prim := prim.GetParent():
+        yield prim
 
 
 def _several_sizes(linear: F64) -> str:
