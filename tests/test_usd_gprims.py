@@ -85,7 +85,7 @@ def test_a_sphere_stays_exact_under_rotation_mirror_and_even_scale() -> None:
     (sphere,) = scene.spheres
     assert sphere.radius == pytest.approx(6.0)
     assert to_stage(scene, sphere.centre) == pytest.approx((1, 2, 3))
-    assert np.array(scene.bounds) == pytest.approx(np.array([[-6, -6, -6], [6, 6, 6]]))
+    assert to_stage(scene, scene.bounds) == pytest.approx(np.array([[-5, -4, -3], [7, 8, 9]]))
 
 
 @pytest.mark.parametrize("text", ['Sphere "P" { double radius = 0 }', 'Cube "P" { double size = -1 }',
