@@ -8,10 +8,12 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from .errors import Cancelled, StageError, UsageError
+from .files import replacing
 from .fit import alike, together
 from .scene import Model, Notice
 from .settings import MODELS
@@ -177,13 +179,9 @@ def _content(path: str) -> bytes:
 
 def _write_pictures(pictures: dict[str, bytes]) -> None:
     for path, content in pictures.items():
-        try:
+        with replacing(path, StageError) as temporary:
             os.makedirs(os.path.dirname(path), exist_ok=True)
-            with open(f"{path}.part", "wb") as file:
-                file.write(content)
-            os.replace(f"{path}.part", path)
-        except OSError as error:
-            raise StageError(f"{path}: cannot be written: {error.strerror}; choose another place for OUT") from error
+            Path(temporary).write_bytes(content)
 
 
 def _go_on(cancel: Callable[[], bool]) -> None:

@@ -5,8 +5,6 @@ OpenImageIO is known here, in `image_files` and in `image_cubemaps` alone, and l
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,8 +14,9 @@ from numpy.typing import NDArray
 
 from .aovs import AOVS, check_names, shape_of
 from .errors import ImageError, UsageError
+from .files import check_place, replacing
 from .image_cubemaps import read_cubemap, read_notes, write_cubemap
-from .image_files import HALF_MAX, MAX_TEXTURE_PIXELS, encoded, extension_of, named_file, read_pixels, reason, replacing
+from .image_files import HALF_MAX, MAX_TEXTURE_PIXELS, encoded, extension_of, named_file, read_pixels, reason
 from .scene import F32, Texture
 from .srgb import srgb_decode, srgb_encode
 
@@ -112,16 +111,7 @@ def check_writable(path: str) -> None:
         ImageError: the folder does not exist or is read-only, or `path` is a folder.
     """
     _extension(path)
-    folder = os.path.dirname(path) or "."
-    if os.path.isdir(path):
-        raise ImageError(f"{path}: is a folder; name a file")
-    if not os.path.isdir(folder):
-        raise ImageError(f"{path}: the folder {folder} does not exist; make it first")
-    try:  # permission bits do not tell everything (read-only mounts, quotas, network folders), so try
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise ImageError(f"{path}: the folder {folder} cannot be written: {error.strerror}") from error
+    check_place(path, ImageError)
 
 
 def write_frame(
@@ -154,7 +144,7 @@ def write_frame(
         ((name, plane),) = planes.items()
         pixels, spec = _eight_bit(path, name, plane, metadata, color_correction)
     data = encoded(path, pixels, spec)
-    with replacing(path) as temporary:
+    with replacing(path, ImageError) as temporary:
         Path(temporary).write_bytes(data)
 
 
@@ -180,7 +170,7 @@ def write_map(path: str, plane: F32, metadata: Mapping[str, str | float]) -> Non
     for key, value in metadata.items():
         spec.attribute(key, value)
     data = encoded(path, np.ascontiguousarray(np.clip(plane, -HALF_MAX, HALF_MAX))[..., None], spec)
-    with replacing(path) as temporary:
+    with replacing(path, ImageError) as temporary:
         Path(temporary).write_bytes(data)
 
 

@@ -21,7 +21,8 @@ import numpy as np
 
 from .cubemaps import LAYOUTS, arrange, faces_of, halved
 from .errors import ImageError, UsageError
-from .image_files import HALF_MAX, check_size, extension_of, memory_file, named_file, read_pixels, reason, replacing
+from .files import replacing
+from .image_files import HALF_MAX, check_size, extension_of, memory_file, named_file, read_pixels, reason
 from .scene import CUBE_LEVELS, F32, Cubemap
 from .srgb import srgb_decode
 
@@ -55,7 +56,7 @@ def write_cubemap(
     chain, exact = _mip_chain(cubemap, layout)
     notes = {**(metadata or {}), _LAYOUT: layout, _RESOLUTION: cubemap.resolution, _LEVELS: exact}
     data = _encoded_levels(path, chain, notes)
-    with replacing(path) as temporary:
+    with replacing(path, ImageError) as temporary:
         Path(temporary).write_bytes(data)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import secrets
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -143,21 +142,6 @@ def _rgba(pixels: NDArray[Any], spec: Any) -> NDArray[Any]:
 
 
 # --- writing -----------------------------------------------------------------------------------------------------
-
-
-@contextmanager
-def replacing(path: str) -> Iterator[str]:
-    """A name beside `path` that becomes `path` when the block ends well, and is removed when it does not."""
-    folder, base = os.path.split(path)
-    stem, extension = os.path.splitext(base)
-    temporary = os.path.join(folder, f".{stem[:32]}.{secrets.token_hex(4)}{extension}")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    except OSError as error:
-        raise ImageError(f"{path}: cannot be written: {error.strerror}; choose another place") from error
-    finally:
-        Path(temporary).unlink(missing_ok=True)
 
 
 def encoded(path: str, pixels: NDArray[Any], spec: Any) -> bytes:

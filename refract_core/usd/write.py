@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import os
-import secrets
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from pxr import Sdf, Tf, UsdUtils
 
 from ..errors import StageError, UsageError
+from ..files import check_place, replacing
 from .layers import copy_of, edit_asset_paths, export, is_expression, outer_of, quiet
 from .package import pack
 
@@ -42,26 +39,13 @@ def check_out(stage: str, out: str, *, overwrite: bool, ours: str = "") -> None:
     """
     if os.path.splitext(out)[1].lower() not in EXTENSIONS:
         raise UsageError(f"{out}: is not the name of a USD file; end it with one of {', '.join(EXTENSIONS)}")
-    _check_folder(out)
+    check_place(out, StageError)
     if not os.path.lexists(out):
         return
     if _same(outer_of(stage), out) or any(_same(outer_of(part), out) for part in _files_of(stage)):
         raise UsageError(f"{out}: the stage {stage} is made of this file, and input is never changed; name another OUT")
     if not overwrite and not is_over(out, stage, made=ours):
         raise UsageError(f"{out}: exists already; choose another name, or replace it with --overwrite")
-
-
-def _check_folder(out: str) -> None:
-    folder = os.path.dirname(out) or "."
-    if os.path.isdir(out):
-        raise StageError(f"{out}: is a folder; name a file")
-    if not os.path.isdir(folder):
-        raise StageError(f"{out}: the folder {folder} does not exist; make it first")
-    try:  # permission bits do not tell everything (read-only mounts, quotas, network folders), so try
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise StageError(f"{out}: the folder {folder} cannot be written: {error.strerror}") from error
 
 
 def _files_of(stage: str) -> list[str]:
@@ -165,19 +149,16 @@ def save(layer: Sdf.Layer, out: str) -> None:
     Raises:
         StageError: the file cannot be written, or something cannot be packed.
     """
-    try:
-        written = copy_of(layer)
-        _record_relative(written, out)
-        with _replacing(out) as temporary:
-            if out.lower().endswith(".usdz"):
-                folder = os.path.dirname(os.path.abspath(out))
-                edit_asset_paths(written, lambda asset: _joined(folder, asset))
-                pack(written, temporary, out)
-            else:
-                edit_asset_paths(written, lambda asset: _relative(asset, out))
-                export(written, temporary, out)
-    except OSError as error:
-        raise StageError(f"{out}: cannot be written: {error.strerror or error}; choose another place") from error
+    written = copy_of(layer)
+    _record_relative(written, out)
+    with replacing(out, StageError) as temporary:
+        if out.lower().endswith(".usdz"):
+            folder = os.path.dirname(os.path.abspath(out))
+            edit_asset_paths(written, lambda asset: _joined(folder, asset))
+            pack(written, temporary, out)
+        else:
+            edit_asset_paths(written, lambda asset: _relative(asset, out))
+            export(written, temporary, out)
 
 
 def _joined(folder: str, asset: str) -> str:
@@ -209,16 +190,3 @@ def _relative(asset: str, out: str) -> str:
     steps = Path(os.path.relpath(outer, folder)).as_posix()
     # Without the dot USD would look through its search path too.
     return (steps if steps.startswith("../") else f"./{steps}") + asset[len(outer) :]
-
-
-@contextmanager
-def _replacing(out: str) -> Iterator[str]:
-    """A name beside `out` that becomes `out` when the block ends well, and is removed when it does not."""
-    folder, base = os.path.split(out)
-    stem, extension = os.path.splitext(base)
-    temporary = os.path.join(folder, f".{stem[:32]}.{secrets.token_hex(4)}{extension.lower()}")
-    try:
-        yield temporary
-        os.replace(temporary, out)
-    finally:
-        Path(temporary).unlink(missing_ok=True)

@@ -1,0 +1,49 @@
+"""Files that appear whole or not at all, in places that were tried before the work."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from .errors import RefractError
+
+
+def check_place(path: str, error: type[RefractError]) -> None:
+    """Refuse a place where no file can be written.
+
+    Raises:
+        error: the folder does not exist or is read-only, or `path` is a folder.
+    """
+    folder = os.path.dirname(path) or "."
+    if os.path.isdir(path):
+        raise error(f"{path}: is a folder; name a file")
+    if not os.path.isdir(folder):
+        raise error(f"{path}: the folder {folder} does not exist; make it first")
+    try:  # permission bits do not tell everything (read-only mounts, quotas, network folders), so try
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as reason:
+        raise error(f"{path}: the folder {folder} cannot be written: {reason.strerror}") from reason
+
+
+@contextmanager
+def replacing(path: str, error: type[RefractError]) -> Iterator[str]:
+    """A name beside `path` that becomes `path` when the block ends well, and is removed when it does not.
+
+    Raises:
+        error: the file cannot be written.
+    """
+    folder, base = os.path.split(path)
+    stem, extension = os.path.splitext(base)
+    temporary = os.path.join(folder, f".{stem[:32]}.{secrets.token_hex(4)}{extension.lower()}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as reason:
+        raise error(f"{path}: cannot be written: {reason.strerror or reason}; choose another place") from reason
+    finally:
+        Path(temporary).unlink(missing_ok=True)
