@@ -7,12 +7,17 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from typing import Any, Protocol
 
+from .bake_errand import Errand, bake_one
 from .bake_files import Baked, Task, batches, file_names, size_text, texture_folder
 from .cubemaps import LAYOUTS
 from .digest import probe_digest
 from .errors import Cancelled, ImageError, UsageError
+from .executors import Crew, patience, sent_stage, spread
+from .files import replacing
 from .progress import Report
 from .scene import Cubemap, Notice, Probe, Scene
 from .version import __version__
@@ -104,7 +109,12 @@ def stale_bakes(probes: Iterable[Probe], scene_at: Callable[[float], Scene]) -> 
 
 
 def bake_probes(
-    order: BakeOrder, report: Report, cancel: Callable[[], bool], *, capture: Capture | None = None
+    order: BakeOrder,
+    report: Report,
+    cancel: Callable[[], bool],
+    *,
+    capture: Capture | None = None,
+    crew: Crew | None = None,
 ) -> None:
     """Bake the probes of a stage and write a layer over it that uses them.
 
@@ -116,7 +126,8 @@ def bake_probes(
         order: checked completely before the first ray, as far as that is possible.
         report: told about progress, notices, and what became of each probe and of OUT.
         cancel: True stops the work.
-        capture: takes the pictures.
+        capture: takes the pictures, here.
+        crew: takes them elsewhere, if given.
 
     Raises:
         RefractError: whatever goes wrong.
@@ -134,7 +145,11 @@ def bake_probes(
         report.warning(notice.path, notice.text)
     with texture_folder(order.out) as folder:
         bakes, tasks = _plan(order, stage, scene, folder, report)
-        for task, baked in _baked(order, scene, tasks, report, cancel, capture):
+        if crew is None:
+            baking = _baked(order, scene, tasks, report, cancel, capture)
+        else:
+            baking = _baked_elsewhere(order, scene, tasks, report, cancel, crew)
+        for task, baked in baking:
             bakes[task.probe.path] = baked
         _stop_if(cancel)
         report.progress(1.0, "writing")
@@ -296,11 +311,36 @@ def _baked(
             _stop_if(cancel)
             record = _record(order, scene, task)
             write_cubemap(task.file, cubemap, order.layout, _to_notes(record, task.probe))
-            size = os.path.getsize(task.file)
-            text = f"baked: {os.path.basename(task.file)}, {cubemap.resolution}, {size_text(size)}, {seconds:.1f} s"
-            report.done(task.probe.path, text)
+            _say_baked(report, task, seconds)
             yield task, Baked(task.file, record, order.resolution)
         done += len(batch)
+
+
+def _say_baked(report: Report, task: Task, seconds: float) -> None:
+    size = size_text(os.path.getsize(task.file))
+    text = f"baked: {os.path.basename(task.file)}, {task.probe.resolution}, {size}, {seconds:.1f} s"
+    report.done(task.probe.path, text)
+
+
+def _baked_elsewhere(
+    order: BakeOrder, scene: Scene, tasks: list[Task], report: Report, cancel: Callable[[], bool], crew: Crew
+) -> Iterator[tuple[Task, Baked]]:
+    """Probes as pieces of work for a crew; what comes back is written here."""
+    records = [_record(order, scene, task) for task in tasks]
+    errands = [
+        Errand(number, task.probe.path, scene.time_code, task.digest, task.probe.resolution,
+               order.samples, order.jobs, order.layout, _to_notes(record, task.probe))
+        for number, (task, record) in enumerate(zip(tasks, records, strict=True))
+    ]  # fmt: skip
+    sent = sent_stage(order.stage, scene.name)
+    results = spread(crew, bake_one, errands, sent, stop=partial(_stop_if, cancel), waiting=patience(report))
+    for done, (errand, (data, seconds)) in enumerate(results, 1):
+        task = tasks[errand.number]
+        with replacing(task.file, ImageError) as temporary:
+            Path(temporary).write_bytes(data)
+        report.progress(done / len(tasks), f"probe {done} of {len(tasks)} done")
+        _say_baked(report, task, seconds)
+        yield task, Baked(task.file, records[errand.number], order.resolution)
 
 
 def _engine() -> Capture:

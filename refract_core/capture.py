@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from typing import Any
 
 import numpy as np
@@ -39,7 +40,7 @@ _BEFORE_WINDOW = 1e-4  # rays start this much before the window, so that what li
 
 
 @kernel
-def capture_rows(world, table, scratch, k, face, y0, y1, volume, mask, near, far, background, jitter):  # type: ignore[no-untyped-def]
+def capture_rows(world, table, scratch, k, face, y0, y1, volume, mask, near, far, background, jitter, seed):  # type: ignore[no-untyped-def]
     """Draw rows y0 .. y1 (y0 a multiple of 4, border not counted) of one face of probe `k`. Returns rays traced.
 
     Args:
@@ -47,6 +48,7 @@ def capture_rows(world, table, scratch, k, face, y0, y1, volume, mask, near, far
         near, far: along the axis of a cube's face; a window has its plane for a near plane [m].
         background: shape (4,): radiance where nothing is met, and 1, or zeros for the sky.
         jitter: shape (S, 2): place of each sample within its texel, -0.5 .. 0.5.
+        seed: of the sampling sequence.
     """
     packet, block, second, limit = scratch.packet, scratch.block, scratch.second, scratch.far
     packet.tally[0] = 0
@@ -61,7 +63,7 @@ def capture_rows(world, table, scratch, k, face, y0, y1, volume, mask, near, far
                     x, y = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
                     if x >= n or y >= y1:
                         continue
-                    block.pixel[lane, 0], block.pixel[lane, 1] = x + n * face, y + 4099 * (k + 1)
+                    block.pixel[lane, 0], block.pixel[lane, 1] = x + n * face, y + 4099 * seed
                     u = (x + 0.5 + jitter[sample, 0]) / n * 2.0 - 1.0
                     v = (y + 0.5 + jitter[sample, 1]) / n * 2.0 - 1.0
                     if planar:
@@ -144,10 +146,12 @@ def fill_table(table: ProbeTable, entries: list[Entry], world: Pointer, run: Any
         near, far = probe.clipping
         volume = np.ascontiguousarray(probe.influence.world_from_volume, np.float64)
         background = np.array([*probe.background, 1.0] if probe.background else [0.0] * 4)
-        here = scratch()
-        return int(
-            capture_rows(world, pointer, here, k, face, y, stop, volume, entries[k].mask, near, far, background, jitter)
+        # By name, not by number: a probe's picture is the same alone and among others.
+        seed = 1 + zlib.crc32(probe.path.encode()) % 65521
+        rays = capture_rows(
+            world, pointer, scratch(), k, face, y, stop, volume, entries[k].mask, near, far, background, jitter, seed
         )
+        return int(rays)
 
     rays = sum(run(draw, tasks))
     _fill_levels(table, [k for k, entry in enumerate(entries) if entry.drawn], entries, run)

@@ -1,12 +1,13 @@
 """Work on other machines: a stage told to workers, pieces of work sent out, results that each come back once.
 
-What spreads is a frame or a probe. The code knows `concurrent.futures` alone, but for two functions that know Dask:
+What spreads is a frame or a probe. The code knows `concurrent.futures` alone, but for the functions that know Dask:
 `crew_at`, which finds the cluster, and `_desk`, which asks a worker whether anybody still waits for its result.
 """
 
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import re
 import secrets
@@ -15,6 +16,7 @@ import socket
 import sys
 import tempfile
 import threading
+import warnings
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
@@ -24,6 +26,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from .errors import RefractError, StageError, UsageError
+from .progress import Report
 from .scene import Notice, Scene
 from .version import __version__
 
@@ -31,6 +34,8 @@ _ADDRESS = re.compile(r"dask://([^\s/:]+|\[[0-9A-Fa-f:.]+\]):(\d{1,5})/?")
 _CONNECT_SECONDS = 10
 _OPEN_STAGES = 4
 """Stages of different orders that a worker keeps open."""
+_SAME = "install the same usd-refract[dask] on the scheduler and all workers, and start them again"
+_LOST = "the cluster is lost: its scheduler has ended, or cannot be reached any more"
 _NOT_HERE = "the stage is not here"
 
 
@@ -62,15 +67,13 @@ def crew_at(address: str) -> Iterator[Crew | None]:
     if found is None or int(found[2]) > 65535:
         raise UsageError(f"--executor is '{address}'; write dask://HOST:PORT, the address that `dask scheduler` prints")
     try:
-        from dask import config
-        from distributed import Client
+        from distributed import Client, Security
     except ImportError as error:
         raise UsageError(
             f"--executor {address} needs Dask, which is not installed: pip install 'usd-refract[dask]'"
         ) from error
-    scheme = "tls" if config.get("distributed.comm.tls.ca-file", None) else "tcp"
-    # A whole stage may go to the scheduler once, of which Dask warns; the pieces of work themselves are small.
-    with config.set({"distributed.admin.large-graph-warning-threshold": "1TB"}):
+    scheme = "tls" if getattr(Security(), "tls_ca_file", None) else "tcp"  # as Dask's own configuration says
+    with _silent("distributed", "distributed.client"):  # what they say about lost connections comes as an error here
         try:
             client = Client(f"{scheme}://{found[1]}:{found[2]}", timeout=_CONNECT_SECONDS, set_as_default=False)
         except (OSError, ValueError) as error:
@@ -79,13 +82,39 @@ def crew_at(address: str) -> Iterator[Crew | None]:
                 "host, port and firewall"
             ) from error
         try:
-            yield Crew(
-                client.get_executor(pure=False),
-                lambda: sum(client.ncores().values()),
-                lambda data: client.submit(_same, data, pure=False),
-            )
+            yield _crew_of(client)
         finally:
             client.close()
+
+
+@contextmanager
+def _silent(*names: str) -> Iterator[None]:
+    loggers = {name: logging.getLogger(name) for name in names}
+    before = {name: logger.level for name, logger in loggers.items()}
+    for logger in loggers.values():
+        logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for name, logger in loggers.items():
+            logger.setLevel(before[name])
+
+
+def _crew_of(client: Any) -> Crew:
+    """The crew of a Dask client."""
+
+    def width() -> int:
+        try:
+            return sum(client.ncores().values())
+        except OSError as error:
+            raise RefractError(_LOST) from error
+
+    def share(data: bytes) -> Any:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Sending large graph")  # a whole stage, but only once
+            return client.submit(_same, data, pure=False)
+
+    return Crew(client.get_executor(pure=False), width, share)
 
 
 def _same(data: bytes) -> bytes:
@@ -171,6 +200,19 @@ def spread(
             future.cancel()
 
 
+def patience(report: Report) -> Callable[[], None]:
+    """A `waiting` for `spread`: says once, and shows, that no worker is there."""
+    said: list[bool] = []
+
+    def waiting() -> None:
+        if not said:
+            said.append(True)
+            report.warning("--executor", "the cluster has no worker; waiting until one joins")
+        report.progress(0.0, "waiting for a worker")
+
+    return waiting
+
+
 def _result_of(future: Future[Any]) -> Any:
     """What a piece of work gave; whatever went wrong, as one of our own errors."""
     try:
@@ -178,12 +220,17 @@ def _result_of(future: Future[Any]) -> Any:
     except RefractError:
         raise
     except CancelledError as error:
-        raise RefractError("the cluster is lost: its scheduler has ended, or cannot be reached any more") from error
+        raise RefractError(_LOST) from error
     except MemoryError as error:
         raise RefractError("a worker is out of memory; give workers more, or run fewer on a machine") from error
     except ModuleNotFoundError as error:
-        raise RefractError(f"a worker cannot run refract: {error}; install usd-refract on every worker") from error
+        raise RefractError(f"a worker cannot run refract: {error}; {_SAME}") from error
     except Exception as error:
+        if "deserialization" in str(error):  # the scheduler looks into the work too
+            raise RefractError(f"the scheduler does not know this version of refract; {_SAME}") from error
+        if type(error).__name__ == "KilledWorker":
+            text = "several workers ended while they did the same piece of work; see their logs. Is memory too small?"
+            raise RefractError(text) from error
         reason = " ".join(str(error).split())[:300]
         raise RefractError(f"the work failed on the cluster: {type(error).__name__}: {reason}") from error
 
@@ -282,7 +329,7 @@ def _perform(function: Callable[[Bench, Any], Any], sent: Sent, shared: bytes | 
     """One piece of work: a tuple with its result, or `_NOT_HERE`."""
     if sent.version != __version__:
         where = socket.gethostname()
-        raise RefractError(f"the worker on {where} has refract {__version__}, not {sent.version}; install the same")
+        raise RefractError(f"the worker on {where} has refract {__version__}, not {sent.version}; {_SAME}")
     desk = _desk()
     with _reading:
         opened = _opened(sent, shared, desk)

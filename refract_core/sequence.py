@@ -6,12 +6,19 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from .errors import Cancelled, UsageError
+from .errors import Cancelled, ImageError, UsageError
+from .executors import Bench, Crew, file_bytes, patience, sent_stage, spread
+from .files import replacing
 from .progress import Report
 from .scene import Notice, Scene
 from .settings import RenderSettings
+
+if TYPE_CHECKING:
+    from .frame import Frame
 
 COMPLEXITIES = ("low", "medium", "high", "veryhigh")
 
@@ -36,13 +43,14 @@ class Order:
     skip_existing: bool = False
 
 
-def render_files(order: Order, report: Report, cancel: Callable[[], bool]) -> None:
+def render_files(order: Order, report: Report, cancel: Callable[[], bool], crew: Crew | None = None) -> None:
     """Render every picture of an order and write it.
 
     Args:
         order: checked completely before the first ray, as far as that is possible.
         report: told about progress, notices and files.
         cancel: True stops the work; files that are complete stay.
+        crew: renders the frames; None renders them here, one after the other.
 
     Raises:
         RefractError: whatever goes wrong.
@@ -61,13 +69,37 @@ def render_files(order: Order, report: Report, cancel: Callable[[], bool]) -> No
             report.done(job.path, "exists, skipped")
     jobs = [job for job in jobs if not (order.skip_existing and os.path.exists(job.path))]
     if jobs:
-        _render_jobs(order, jobs, report, cancel)
+        _render_jobs(order, jobs, report, cancel, crew)
 
 
-def _render_jobs(order: Order, jobs: Sequence[Any], report: Report, cancel: Callable[[], bool]) -> None:
-    from .render import render
+class _Shot(NamedTuple):
+    """One picture to make. The same shot of the same stage gives the same bytes, wherever it is rendered."""
+
+    time_code: float | None
+    path: str
+    settings: RenderSettings
+    aovs: tuple[str, ...]
+    color_correction: str
+    first: bool
+    """Looks for stale probes as well."""
+
+
+class _Picture(NamedTuple):
+    """A shot that a worker has made."""
+
+    data: bytes
+    """the file"""
+    width: int
+    height: int
+    notices: tuple[Notice, ...]
+    seconds: float
+
+
+def _render_jobs(
+    order: Order, jobs: Sequence[Any], report: Report, cancel: Callable[[], bool], crew: Crew | None
+) -> None:
     from .usd.settings import read_settings
-    from .usd.stage import open_stage, scene_from_stage
+    from .usd.stage import open_stage
 
     told: set[Notice] = set()
 
@@ -84,34 +116,105 @@ def _render_jobs(order: Order, jobs: Sequence[Any], report: Report, cancel: Call
         found.append(Notice("--complexity", "subdivision is not done yet, so every complexity draws the same"))
     settings = _settings(read_settings(stage, order.settings_prim, found), order.overrides)
     tell(found)
-    for done, job in enumerate(jobs):
+    choices = settings, order.aovs, order.color_correction
+    shots = [_Shot(job.time_code, job.path, *choices, job is jobs[0]) for job in jobs]
+    if crew is None:
+        _render_here(stage, shots, tell, report, cancel)
+    else:
+        _render_elsewhere(order, stage, shots, tell, report, cancel, crew)
+
+
+Tell = Callable[[Sequence[Notice]], None]
+
+
+def _render_here(stage: Any, shots: Sequence[_Shot], tell: Tell, report: Report, cancel: Callable[[], bool]) -> None:
+    from .usd.stage import scene_from_stage
+
+    read = partial(scene_from_stage, stage)
+    for done, shot in enumerate(shots):
         started = time.perf_counter()
+        frame = _draw(read, shot, tell, _part(report, done, len(shots)), cancel)
         _stop_if(cancel)
-        scene = scene_from_stage(stage, time_code=job.time_code, purposes=settings.purposes, camera=settings.camera)
-        tell(scene.notices)
-        if done == 0:
-            tell(_stale(stage, scene, settings))
-        _stop_if(cancel)
-        frame = render(scene, settings, progress=_part(report, done, len(jobs)), cancel=cancel)
-        tell(frame.notices)
-        _stop_if(cancel)
-        frame.save(job.path, aovs=order.aovs, color_correction=order.color_correction)
-        seconds = time.perf_counter() - started
-        size = os.path.getsize(job.path)
-        report.done(job.path, f"{frame.width} x {frame.height}, {_bytes(size)}, {seconds:.1f} s")
+        frame.save(shot.path, aovs=shot.aovs, color_correction=shot.color_correction)
+        _say_done(report, shot, frame.width, frame.height, time.perf_counter() - started)
 
 
-def _stale(stage: Any, scene: Scene, settings: RenderSettings) -> list[Notice]:
+def _draw(
+    read: Callable[..., Scene],
+    shot: _Shot,
+    tell: Tell,
+    progress: Callable[[float, str], None],
+    cancel: Callable[[], bool],
+) -> Frame:
+    """Read the stage at the shot's time and render it.
+
+    Args:
+        read: `scene_from_stage` of a stage.
+    """
+    from .render import render
+
+    _stop_if(cancel)
+    settings = shot.settings
+    scene = read(time_code=shot.time_code, purposes=settings.purposes, camera=settings.camera)
+    tell(scene.notices)
+    if shot.first:
+        tell(_stale(read, scene, settings))
+    _stop_if(cancel)
+    frame = render(scene, settings, progress=progress, cancel=cancel)
+    tell(frame.notices)
+    return frame
+
+
+def _render_elsewhere(
+    order: Order,
+    stage: Any,
+    shots: Sequence[_Shot],
+    tell: Tell,
+    report: Report,
+    cancel: Callable[[], bool],
+    crew: Crew,
+) -> None:
+    """Frames as pieces of work for a crew; what comes back is written here, so that each is written once and whole."""
+    root = stage.GetRootLayer()
+    sent = sent_stage(order.stage, root.realPath or root.identifier)
+    report.progress(0.0, "waiting for the first frame")
+    results = spread(crew, _picture, shots, sent, stop=partial(_stop_if, cancel), waiting=patience(report))
+    for done, (shot, picture) in enumerate(results, 1):
+        tell(picture.notices)
+        with replacing(shot.path, ImageError) as temporary:
+            Path(temporary).write_bytes(picture.data)
+        report.progress(done / len(shots), f"frame {done} of {len(shots)} done")
+        _say_done(report, shot, picture.width, picture.height, picture.seconds)
+
+
+def _picture(bench: Bench, shot: _Shot) -> _Picture:
+    """One frame, on a worker."""
+    started = time.perf_counter()
+    notices: dict[Notice, None] = {}
+    frame = _draw(bench.read, shot, lambda some: notices.update(dict.fromkeys(some)), _unheard, bench.cancel)
+    data = file_bytes(lambda path: frame.save(path, aovs=shot.aovs, color_correction=shot.color_correction), shot.path)
+    return _Picture(data, frame.width, frame.height, tuple(notices), time.perf_counter() - started)
+
+
+def _unheard(_fraction: float, _stage: str) -> None:
+    """Progress within a frame, which nobody far away listens to."""
+
+
+def _say_done(report: Report, shot: _Shot, width: int, height: int, seconds: float) -> None:
+    size = os.path.getsize(shot.path)
+    report.done(shot.path, f"{width} x {height}, {_bytes(size)}, {seconds:.1f} s")
+
+
+def _stale(read: Callable[..., Scene], scene: Scene, settings: RenderSettings) -> list[Notice]:
     """Baked probes that no longer show what is there; each is asked about the time it was baked at."""
     if not any(probe.bake for probe in scene.probes):
         return []
     from .bake import stale_bakes
-    from .usd.stage import scene_from_stage
 
     def scene_at(time_code: float) -> Scene:
         if time_code == scene.time_code and settings.purposes == RenderSettings().purposes:
             return scene
-        return scene_from_stage(stage, time_code=time_code)
+        return read(time_code=time_code)
 
     return stale_bakes(scene.probes, scene_at)
 

@@ -15,6 +15,7 @@ from scenes import (
     dome,
     draw,
     glass,
+    light,
     material,
     position_room,
     quad,
@@ -23,7 +24,8 @@ from scenes import (
     where,
 )
 
-from refract_core.scene import Cubemap, Model, Probe, Sphere, Volume
+from refract_core.render import capture_probes
+from refract_core.scene import Cubemap, LightKind, Model, Probe, Sphere, Volume
 
 BALL = Sphere("/ball", (0.0, 0.0, 0.0), 0.7, 0)
 
@@ -184,3 +186,16 @@ def test_near_things_stay_sharp_by_hdrps_distance_based_roughness() -> None:
         picture = draw(replace(what, cameras=(lens,)), 48, 48, tiers=("probe",), screen="proxy")
         contrast[option] = float(picture["refraction"][12:36, 12:36, 0].std())
     assert contrast[True] > 1.5 * contrast[False]
+
+
+def test_a_probes_picture_is_the_same_alone_and_among_others() -> None:
+    """Noise included: a soft shadow under an area light, taken once alone and once as the second of two."""
+    floor = quad("/floor", [(-3, -1, 3), (3, -1, 3), (3, -1, -3), (-3, -1, -3)], 0)
+    lamp = light(LightKind.RECT, (0, 2.5, 0), (0, -1, 0), (1.5, 1.5), 4.0)
+    block = box("/block", (0.4, 0.1, 0.4), 0, centre=(0.2, 0.5, 0))
+    what = scene([floor, block], [material("/white", DIFFUSE=0.8)], lights=(lamp,))
+    one, other = probe(path="/one", resolution=32), probe((0.5, 0, 0), path="/other", resolution=16)
+    (alone,) = capture_probes(what, [one], samples=2)
+    _, among = capture_probes(what, [other, one], samples=2)
+    assert alone.levels[0][..., :3].std() > 0.01
+    np.testing.assert_array_equal(alone.levels[0], among.levels[0])

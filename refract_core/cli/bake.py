@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from ..bake import BakeOrder, bake_probes
+from ..executors import crew_at
 from .app import Jobs, ProgressMode, app, outcome, words
 
 bake = typer.Typer(help="Work something out once and keep it in a layer over the stage.", no_args_is_help=True)
@@ -35,6 +36,13 @@ Layout = Annotated[
     typer.Option(metavar="strip|cross|latlong", help="How the faces lie in the file. A strip is read back exactly."),
 ]
 Samples = Annotated[int, typer.Option(help="Rays per texel, 1 to 4096.")]
+Executor = Annotated[
+    str,
+    typer.Option(
+        metavar="dask://HOST:PORT",
+        help="Bake on the workers of this Dask cluster, a probe at a time. Without it they are baked here.",
+    ),
+]
 Force = Annotated[bool, typer.Option("--force", help="Bake all, also what is up to date.")]
 SkipExisting = Annotated[
     bool, typer.Option("--skip-existing", help="Leave textures that exist as they are, up to date or not.")
@@ -56,6 +64,7 @@ def bake_probes_command(
     skip_existing: SkipExisting = False,
     overwrite: Overwrite = False,
     jobs: Jobs = None,
+    executor: Executor = "",
     progress: ProgressMode = "auto",
 ) -> None:
     """Bake reflection probes to EXR cubemaps, and write a layer over STAGE that uses them.
@@ -76,5 +85,5 @@ def bake_probes_command(
         skip_existing=skip_existing,
         overwrite=overwrite,
     )
-    with outcome(progress) as (report, cancel):
-        bake_probes(order, report, cancel)
+    with outcome(progress) as (report, cancel), crew_at(executor) as crew:
+        bake_probes(order, report, cancel, crew=crew)

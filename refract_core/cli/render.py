@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from ..executors import crew_at
 from ..sequence import Order, render_files
 from .app import Jobs, ProgressMode, app, outcome, words
 
@@ -100,6 +101,13 @@ SettingsPrim = Annotated[
     ),
 ]
 TileSize = Annotated[int | None, typer.Option(hidden=True)]
+Executor = Annotated[
+    str,
+    typer.Option(
+        metavar="dask://HOST:PORT",
+        help="Render the frames on the workers of this Dask cluster. Without it they are rendered here.",
+    ),
+]
 SkipExisting = Annotated[bool, typer.Option("--skip-existing", help="Leave pictures that exist as they are.")]
 
 
@@ -123,6 +131,7 @@ def render(
     exposure: Exposure = None,
     render_settings_prim_path: SettingsPrim = "",
     jobs: Jobs = None,
+    executor: Executor = "",
     tile_size: TileSize = None,
     skip_existing: SkipExisting = False,
     progress: ProgressMode = "auto",
@@ -153,8 +162,8 @@ def render(
         complexity=complexity,
         skip_existing=skip_existing,
     )
-    with outcome(progress) as (report, cancel):
-        render_files(order, report, cancel)
+    with outcome(progress) as (report, cancel), crew_at(executor) as crew:
+        render_files(order, report, cancel, crew)
 
 
 def _purposes(text: str) -> tuple[str, ...]:
