@@ -18,17 +18,20 @@ MAX_LINES = 400
 
 # Library -> the only places that may import it, as the start of a module's name.
 ROOMS = {
-    "pxr": ("refract_core.usd", "schemas"),
+    "pxr": ("refract_core.usd", "schemas", "service.precheck"),
     "embreex": ("refract_core.embree",),
     "ctypes": ("refract_core.embree", "service"),
     "llvmlite": ("refract_core.embree", "refract_core.kernel", "refract_core.pointer"),
     "OpenImageIO": ("refract_core.image", "refract_core.image_files", "refract_core.image_cubemaps"),
     "pygltflib": ("refract_core.gltf",),
     "flip_evaluator": ("refract_core.compare",),
+    "distributed": ("refract_core.executors",),
+    "dask": ("refract_core.executors",),
     "fastapi": ("service",),
     "starlette": ("service",),
     "uvicorn": ("service",),
     "pydantic": ("service",),
+    "prometheus_client": ("service.metrics",),
     "typer": ("refract_core.cli",),
     "click": ("refract_core.cli",),
 }

@@ -18,7 +18,16 @@ ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "usd_samples").rglob("*.md"))]
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 # What a page may ask a reader to type that `.ci/run` and the benchmarks do, not these tests.
-_ELSEWHERE = ("pip install", "pytest", ".ci/run", "python -m benchmarks.", "python docs/", "python -m schemas.generate")
+_ELSEWHERE = (
+    "curl",
+    "refract serve",
+    "pip install",
+    "pytest",
+    ".ci/run",
+    "python -m benchmarks.",
+    "python docs/",
+    "python -m schemas.generate",
+)
 _SMALL = {"render": ["--image-width", "32", "--samples", "1"], "bake probes": ["--samples", "1"]}
 
 

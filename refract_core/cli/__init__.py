@@ -12,6 +12,7 @@ from . import (  # noqa: F401  a command is known once its module is loaded
     inspect,
     node,
     render,
+    serve,
     validate,
 )
 from .app import CANCELLED, app

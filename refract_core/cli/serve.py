@@ -1,0 +1,117 @@
+"""`refract serve`."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..errors import UsageError
+from .app import app, outcome
+
+Host = Annotated[str, typer.Option(help="Address to listen on. The default takes requests of this machine only.")]
+Port = Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 takes a free one and prints it.")]
+StageRoot = Annotated[
+    str,
+    typer.Option(
+        metavar="FOLDER", envvar="REFRACT_STAGE_ROOT", help="Stages that requests may name. Without it, uploads only."
+    ),
+]
+Workers = Annotated[
+    int | None, typer.Option(envvar="REFRACT_WORKERS", help="Jobs at once. The default is the number of cores.")
+]
+Queue = Annotated[int, typer.Option(envvar="REFRACT_QUEUE", help="Jobs that may wait; one more is refused with 429.")]
+Data = Annotated[
+    str,
+    typer.Option(
+        metavar="FOLDER",
+        envvar="REFRACT_DATA",
+        help="Where jobs and results are kept, also over a restart. Without it, a new temporary folder.",
+    ),
+]
+TokenFile = Annotated[
+    str,
+    typer.Option(
+        metavar="FILE",
+        envvar="REFRACT_TOKEN_FILE",
+        help="Bearer tokens, one a line, one of which each request must bring. Without it, everybody may come.",
+    ),
+]
+Limit = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--limit",
+        metavar="NAME=NUMBER",
+        help="Change one limit, such as job_seconds=60; may be repeated. /v1/limits and `--limits` list them. The "
+        "environment does it too: REFRACT_LIMIT_JOB_SECONDS=60.",
+    ),
+]
+ShowLimits = Annotated[bool, typer.Option("--limits", help="Print every limit with its value, and exit.")]
+
+
+@app.command()
+def serve(
+    host: Host = "127.0.0.1",
+    port: Port = 8000,
+    stage_root: StageRoot = "",
+    workers: Workers = None,
+    queue: Queue = 16,
+    data: Data = "",
+    token_file: TokenFile = "",
+    limit: Limit = None,
+    limits: ShowLimits = False,
+) -> None:
+    """Serve renders, conversions and checks over HTTP, with a page at /.
+
+    Every stage is opened by a process of its own, which may read nothing but that stage and dies with its job.
+    """
+    with outcome("none"):
+        from service.limits import limits_from, table
+
+        chosen = limits_from(_numbers(limit or []))
+        if limits:
+            for row in table(chosen):
+                typer.echo(f"{row['name']:18} {row['value']:>12} {row['unit']:10} {row['meaning']}")
+            return
+        from service.app import Settings
+        from service.serve import serve as run
+
+        settings = Settings(
+            stage_root=stage_root, data=data, workers=workers or os.cpu_count() or 1, queue=queue,
+            tokens=_tokens(token_file), limits=chosen,
+        )  # fmt: skip
+        run(settings, host, port)
+
+
+def _numbers(given: list[str]) -> dict[str, int | None]:
+    """`NAME=NUMBER` pairs."""
+    from dataclasses import fields
+
+    from service.limits import Limits
+
+    known = [one.name for one in fields(Limits)]
+    found: dict[str, int | None] = {}
+    for text in given:
+        name, _, number = text.partition("=")
+        if name not in known:
+            raise UsageError(f"--limit {text}: there is no such limit; choose from {', '.join(known)}")
+        try:
+            found[name] = int(number)
+        except ValueError as error:
+            raise UsageError(f"--limit {text}: write NAME=NUMBER, with a whole number of 1 or more") from error
+    return found
+
+
+def _tokens(path: str) -> tuple[str, ...]:
+    if not path:
+        return ()
+    try:
+        lines = Path(path).read_text("utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"--token-file {path}: cannot be read") from error
+    tokens = tuple(line.strip() for line in lines if line.strip() and not line.startswith("#"))
+    if not tokens:
+        raise UsageError(f"--token-file {path}: holds no token; write one a line, or leave the option out")
+    return tokens

@@ -1,0 +1,163 @@
+"""The app: `create_app(settings)` for any ASGI server; `refract serve` runs it with uvicorn."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import AsyncIterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import Any
+
+from fastapi import FastAPI, HTTPException, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import HTMLResponse, JSONResponse
+from fastapi.staticfiles import StaticFiles
+from starlette.exceptions import HTTPException as StarletteHTTPException
+
+from refract_core.errors import UsageError
+from refract_core.version import __version__
+
+from . import pages, routes
+from .edge import Edge
+from .jobs import Jobs
+from .limits import Limits
+from .metrics import CONTENT_TYPE, Metrics
+from .problems import BY_STATUS, KINDS, MEDIA_TYPE, Problem, respond
+from .store import Store
+
+log = logging.getLogger("refract.service")
+_STATIC = Path(__file__).parent / "static"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """How one service is set up."""
+
+    stage_root: str = ""
+    """Folder of stages that requests may name; '' means uploads only."""
+    data: str = ""
+    """Folder of jobs and results; '' makes a new temporary one."""
+    workers: int = 2
+    """Jobs at once."""
+    queue: int = 16
+    """Jobs that may wait."""
+    tokens: tuple[str, ...] = ()
+    """Bearer tokens, one of which every request under /v1 must bring; none means open to all."""
+    limits: Limits = field(default_factory=Limits)
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.workers <= 256:
+            raise UsageError(f"--workers is {self.workers}; it must be between 1 and 256")
+        if not 0 <= self.queue <= 100_000:
+            raise UsageError(f"--queue is {self.queue}; it must be between 0 and 100000")
+        if self.stage_root and not Path(self.stage_root).is_dir():
+            raise UsageError(f"--stage-root {self.stage_root}: there is no such folder")
+        if any(len(token) < 8 for token in self.tokens):
+            raise UsageError("a bearer token is shorter than 8 characters; take a long random one")
+
+
+def create_app(settings: Settings | None = None) -> FastAPI:
+    """The service as an ASGI app.
+
+    Raises:
+        UsageError: the folder for jobs cannot be used.
+    """
+    settings = settings or Settings()
+    metrics = Metrics()
+    try:
+        store = Store(Path(settings.data or mkdtemp(prefix="refract-service-")).resolve())
+    except OSError as error:
+        raise UsageError(f"--data {settings.data}: cannot be used: {error.strerror}") from error
+    root = Path(settings.stage_root).resolve() if settings.stage_root else None
+    jobs = Jobs(
+        store, settings.limits, metrics, workers=settings.workers, queue=settings.queue, stage_root=root
+    )
+
+    @contextlib.asynccontextmanager
+    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+        jobs.start()
+        try:
+            yield
+        finally:
+            await jobs.stop()
+
+    app = FastAPI(
+        title="refract", version=__version__, docs_url=None, redoc_url=None, lifespan=lifespan,
+        description="Renders USD stages with glass in them.", redirect_slashes=False,
+    )  # fmt: skip
+    app.state.jobs, app.state.settings, app.state.metrics = jobs, settings, metrics
+    app.add_middleware(Edge, tokens=settings.tokens, metrics=metrics)
+    _add_handlers(app)
+    _add_pages(app, settings, metrics)
+    app.include_router(routes.router)
+    app.mount("/static", StaticFiles(directory=_STATIC, check_dir=False), name="static")
+    return app
+
+
+def _add_handlers(app: FastAPI) -> None:
+    """Every error of every layer becomes a problem document."""
+
+    async def on_problem(request: Request, error: Exception) -> Response:
+        assert isinstance(error, Problem)
+        return respond(error)
+
+    async def on_http(request: Request, error: Exception) -> Response:
+        assert isinstance(error, StarletteHTTPException)
+        slug = BY_STATUS.get(error.status_code, "bad-request" if error.status_code < 500 else "internal")
+        return respond(Problem(slug, KINDS[slug].title, headers=dict(error.headers or {})))
+
+    async def on_validation(request: Request, error: Exception) -> Response:
+        return respond(Problem("invalid-settings", "a parameter of the path or query is not valid"))
+
+    async def on_anything(request: Request, error: Exception) -> Response:
+        identifier = getattr(request.state, "request_id", "")
+        log.error("request %s failed", identifier, exc_info=error)
+        return respond(Problem("internal", f"the request's id is {identifier}"))
+
+    app.add_exception_handler(Problem, on_problem)
+    app.add_exception_handler(StarletteHTTPException, on_http)
+    app.add_exception_handler(HTTPException, on_http)
+    app.add_exception_handler(RequestValidationError, on_validation)
+    app.add_exception_handler(Exception, on_anything)
+
+
+def _add_pages(app: FastAPI, settings: Settings, metrics: Metrics) -> None:
+    problem: Mapping[int | str, dict[str, Any]] = {503: {"description": "not ready", "content": {MEDIA_TYPE: {}}}}
+
+    @app.get("/livez", summary="The process answers")
+    async def livez() -> dict[str, str]:
+        return {"status": "alive"}
+
+    @app.get("/readyz", summary="Jobs are taken", responses=dict(problem))
+    async def readyz(request: Request) -> JSONResponse:
+        """Whether a worker is warm, with what confines it on this machine."""
+        jobs: Jobs = request.app.state.jobs
+        if jobs.draining or not jobs.nursery.ready.is_set():
+            why = "the service is about to stop" if jobs.draining else "the first worker is not warm yet"
+            raise Problem("unavailable", why, headers={"Retry-After": "2"})
+        if not jobs.store.writable():
+            raise Problem("unavailable", "the folder of jobs cannot be written", headers={"Retry-After": "30"})
+        return JSONResponse({"status": "ready", "confinement": jobs.nursery.report})
+
+    @app.get("/metrics", summary="For Prometheus", response_class=Response)
+    async def prometheus() -> Response:
+        return Response(metrics.text(), headers={"Content-Type": CONTENT_TYPE})
+
+    @app.get("/docs", include_in_schema=False)
+    async def docs() -> HTMLResponse:
+        return HTMLResponse(pages.docs_page(app.openapi(), settings.limits))
+
+    @app.get("/problems/{slug}", include_in_schema=False)
+    async def about_problem(slug: str) -> HTMLResponse:
+        if slug not in KINDS:
+            raise Problem("not-found", "there is no such type of problem")
+        return HTMLResponse(pages.problem_page(slug))
+
+    @app.get("/", include_in_schema=False)
+    async def front() -> HTMLResponse:
+        page = _STATIC / "index.html"
+        if not page.is_file():
+            raise Problem("not-found", "the page is not installed")
+        return HTMLResponse(page.read_text("utf-8"))

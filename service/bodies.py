@@ -1,0 +1,189 @@
+"""Bodies of requests: multipart or JSON, read with a limit on bytes and time, checked before anything is done."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import secrets
+import shutil
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn
+
+from pydantic import ValidationError
+from starlette.datastructures import UploadFile
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.types import Message
+
+from .limits import Limits
+from .models import StageOnly
+from .problems import Problem
+from .tasks import pointer
+
+SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
+_MAGIC = {b"#usda ": ".usda", b"PXR-USDC": ".usdc", b"PK\x03\x04": ".usdz"}
+
+
+class Wish(NamedTuple):
+    """A request, understood."""
+
+    settings: StageOnly
+    upload: Path | None
+    """The uploaded stage in a temporary file, which the reader of this must move or remove."""
+    suffix: str
+
+
+async def read_wish(request: Request, model: type[StageOnly], limits: Limits, folder: Path) -> Wish:
+    """Read and check a body.
+
+    Raises:
+        Problem: 400, 408, 413, 415 or 422.
+    """
+    try:
+        async with asyncio.timeout(limits.body_seconds):
+            return await _read(request, model, limits, folder)
+    except TimeoutError:
+        raise Problem("request-timeout", f"the body did not arrive within {limits.body_seconds} s") from None
+
+
+async def _read(request: Request, model: type[StageOnly], limits: Limits, folder: Path) -> Wish:
+    media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if media not in ("multipart/form-data", "application/json"):
+        raise Problem("unsupported-media-type", "send application/json, or multipart/form-data with a stage")
+    if request.headers.get("content-encoding", "identity").lower() != "identity":
+        raise Problem("unsupported-media-type", "send the body without Content-Encoding")
+    if media == "application/json":
+        limited = _limited(request, limits.settings_bytes)
+        settings = check(model, parse(b"".join([part async for part in limited.stream()])))
+        if settings.stage is None:
+            raise invalid("/stage", "is missing; name a stage of GET /v1/stages, or upload one as multipart/form-data")
+        return Wish(settings, None, "")
+    return await _read_form(_limited(request, limits.body_bytes), model, limits, folder)
+
+
+async def _read_form(request: Request, model: type[StageOnly], limits: Limits, folder: Path) -> Wish:
+    try:
+        form = await request.form(max_files=2, max_fields=4, max_part_size=limits.settings_bytes)
+    except HTTPException as error:
+        raise Problem("bad-request", f"the multipart body cannot be read: {str(error.detail)[:200]}") from None
+    try:
+        parts = form.multi_items()
+        for name, _ in parts:
+            if name not in ("stage", "settings"):
+                raise invalid(f"/{pointer(name[:100])}", "is no part of this request; send stage and settings")
+        if len({name for name, _ in parts}) != len(parts):
+            raise Problem("bad-request", "a part comes twice")
+        text: Any = form.get("settings") or "{}"
+        if isinstance(text, UploadFile):
+            text = await text.read(limits.settings_bytes + 1)
+            if len(text) > limits.settings_bytes:
+                raise Problem("too-large", f"settings may have {limits.settings_bytes} bytes")
+        settings = check(model, parse(text))
+        stage = form.get("stage")
+        if not isinstance(stage, UploadFile):
+            raise invalid("/stage", "is missing; upload a file under this name, or name a stage in a JSON body")
+        if settings.stage is not None:
+            raise invalid("/stage", "a file is uploaded already; leave it out of the settings")
+        suffix = _suffix(await stage.read(8))
+        await stage.seek(0)
+        path = folder / f"upload-{secrets.token_hex(8)}"
+        await asyncio.to_thread(_store, stage, path, limits.stage_bytes)
+        return Wish(settings, path, suffix)
+    finally:
+        await form.close()
+
+
+def _store(stage: UploadFile, path: Path, most: int) -> None:
+    if (stage.size or 0) > most:
+        raise Problem("too-large", f"the stage has {stage.size} bytes; the limit is {most}")
+    with open(path, "xb") as file:
+        shutil.copyfileobj(stage.file, file, 1 << 20)
+
+
+def _suffix(start: bytes) -> str:
+    for magic, suffix in _MAGIC.items():
+        if start.startswith(magic):
+            return suffix
+    raise Problem("unsupported-media-type", "the file is not USD; send .usda, .usdc, .usd or .usdz")
+
+
+def _limited(request: Request, most: int) -> Request:
+    """The same request, which raises as soon as it is known that the body is too large."""
+    detail = f"the limit is {most} bytes"
+    declared = request.headers.get("content-length", "")
+    if declared.isdigit() and int(declared[:20]) > most:
+        raise Problem("too-large", f"the body has {declared[:20]} bytes; {detail}")
+    count = 0
+    inner = request.receive
+
+    async def receive() -> Message:
+        nonlocal count
+        message = await inner()
+        count += len(message.get("body", b""))
+        if count > most:
+            raise Problem("too-large", f"the body is too large; {detail}")
+        return message
+
+    return Request(request.scope, receive)
+
+
+def parse(text: str | bytes) -> Any:
+    """JSON without what is not JSON: NaN, Infinity. Raises Problem."""
+
+    def refuse(constant: str) -> NoReturn:
+        raise ValueError(constant)
+
+    try:
+        return json.loads(text, parse_constant=refuse)
+    except (ValueError, RecursionError):
+        raise Problem("bad-request", "the settings are not JSON (RFC 8259)") from None
+
+
+def check(model: type[StageOnly], value: Any) -> StageOnly:
+    """Validate settings. Raises Problem with a pointer for each field; the input itself is never echoed."""
+    try:
+        return model.model_validate(value)
+    except ValidationError as error:
+        errors = [
+            {"pointer": "".join(f"/{pointer(str(step)[:100])}" for step in one["loc"]), "detail": one["msg"][:300]}
+            for one in error.errors(include_url=False, include_context=False, include_input=False)[:20]
+        ]
+        text = f"{len(errors)} of the settings are not valid, the first at '{errors[0]['pointer']}'"
+        raise Problem("invalid-settings", text, errors=errors) from None
+
+
+def invalid(where: str, detail: str) -> Problem:
+    return Problem("invalid-settings", f"{where}: {detail}"[:500],
+                   errors=[{"pointer": where, "detail": detail}])  # fmt: skip
+
+
+# --- stages of ours ---------------------------------------------------------------------------------------------------
+
+
+def stages(root: Path | None) -> list[dict[str, Any]]:
+    """Stages under the root, the shallow ones first."""
+    found = []
+    for folder, folders, names in os.walk(root or os.devnull):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for name in sorted(names):
+            path = Path(folder, name)
+            if path.suffix.lower() in SUFFIXES and path.is_file() and not name.startswith("."):
+                found.append({"path": path.relative_to(root or "/").as_posix(), "bytes": path.stat().st_size})
+    return sorted(found, key=lambda one: (str(one["path"]).count("/"), one["path"]))[:1000]
+
+
+def own_stage(root: Path | None, name: str) -> str:
+    """Path of a stage under the root, checked. Raises Problem."""
+    problem = invalid("/stage", "there is no such stage here; see GET /v1/stages")
+    if root is None or name.startswith(("/", "~")) or "\\" in name or ".." in name.split("/"):
+        raise problem
+    top = root.resolve()
+    try:
+        path = (top / name).resolve()
+        known = path.is_relative_to(top) and path.suffix.lower() in SUFFIXES and path.is_file()
+    except (OSError, ValueError):
+        known = False
+    if not known:
+        raise problem
+    return path.relative_to(top).as_posix()

@@ -1,0 +1,89 @@
+"""Every limit of the service in one table: name, default, unit and meaning.
+
+Each can be set by a flag of `refract serve` (`--limit NAME=NUMBER`), or by the environment
+(`REFRACT_LIMIT_NAME`). A request may ask for less, never for more. `GET /v1/limits` shows what holds.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from refract_core.errors import UsageError
+
+PREFIX = "REFRACT_LIMIT_"
+
+
+def _limit(default: int, unit: str, meaning: str) -> Any:
+    return field(default=default, metadata={"unit": unit, "meaning": meaning})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """All of them are whole numbers above 0."""
+
+    body_bytes: int = _limit(64 << 20, "bytes", "body of one request")
+    body_seconds: int = _limit(30, "s", "time for a request's body to arrive")
+    header_seconds: int = _limit(10, "s", "time for a request's head to arrive")
+    settings_bytes: int = _limit(256 << 10, "bytes", "settings of one request, as JSON")
+    stage_bytes: int = _limit(64 << 20, "bytes", "one uploaded stage, and what its package holds when unpacked")
+    layers: int = _limit(256, "files", "layers that one stage is composed of")
+    pixels: int = _limit(1 << 22, "pixels", "width times height of a picture")
+    samples: int = _limit(64, "per pixel", "samples of a pixel")
+    pixel_samples: int = _limit(1 << 25, "samples", "width times height times samples")
+    aovs: int = _limit(16, "planes", "AOVs of one request")
+    triangles: int = _limit(20_000_000, "triangles", "triangles of a stage, instances counted")
+    texture_pixels: int = _limit(1 << 26, "pixels", "one texture")
+    job_seconds: int = _limit(120, "s", "wall clock of one job, without its time in the queue")
+    cpu_seconds: int = _limit(300, "s", "processor time of one job, all threads together")
+    memory_bytes: int = _limit(4 << 30, "bytes", "address space of one job beyond that of an idle worker")
+    result_bytes: int = _limit(256 << 20, "bytes", "one file written by a job")
+    open_files: int = _limit(256, "files", "files open at once in a job")
+    warnings: int = _limit(200, "entries", "warnings kept of one job")
+    event_streams: int = _limit(100, "streams", "clients that listen to events at once")
+    retention_seconds: int = _limit(24 * 3600, "s", "time a finished job and its results are kept")
+    retention_bytes: int = _limit(2 << 30, "bytes", "results kept in all; the oldest go first")
+    drain_seconds: int = _limit(20, "s", "time running jobs get to finish when the service is asked to stop")
+
+    def __post_init__(self) -> None:
+        for one in fields(self):
+            value = getattr(self, one.name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise UsageError(f"limit {one.name} is {value}; it must be a whole number of 1 or more")
+
+
+def limits_from(given: Mapping[str, int | None], environment: Mapping[str, str] | None = None) -> Limits:
+    """Defaults, then the environment, then what is given.
+
+    Raises:
+        UsageError: a value is no number above 0, or a variable names no limit.
+    """
+    environment = os.environ if environment is None else environment
+    names = [one.name for one in fields(Limits)]
+    chosen: dict[str, int] = {}
+    for variable, text in environment.items():
+        if not variable.startswith(PREFIX):
+            continue
+        name = variable.removeprefix(PREFIX).lower()
+        if name not in names:
+            raise UsageError(f"{variable}: there is no such limit; choose from {', '.join(names)}")
+        try:
+            chosen[name] = int(text)
+        except ValueError as error:
+            raise UsageError(f"{variable} is '{text}'; it must be a whole number of 1 or more") from error
+    chosen.update({name: value for name, value in given.items() if value is not None})
+    return Limits(**chosen)
+
+
+def table(limits: Limits) -> list[dict[str, str | int]]:
+    """What `/v1/limits` and the documentation show."""
+    return [
+        {
+            "name": one.name, "value": getattr(limits, one.name), "default": int(str(one.default)),
+            "unit": one.metadata["unit"], "meaning": one.metadata["meaning"],
+            "variable": f"{PREFIX}{one.name.upper()}", "flag": f"--limit {one.name}=",
+        }
+        for one in fields(limits)
+    ]  # fmt: skip

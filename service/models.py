@@ -1,0 +1,102 @@
+"""What a request may ask for. Strict: no unknown field, no NaN, no number for a bool or bool for a number."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+
+Model = Literal["none", "sphere", "box", "thin", "traced"]
+Tier = Literal["screen", "ray", "probe", "sky"]
+Purpose = Literal["default", "render", "proxy", "guide"]
+Aov = Literal[
+    "beauty", "refraction", "reflection", "transmittance", "N", "P", "Z", "mask", "thickness", "path_length", "layers",
+    "weight.screen", "weight.ray", "weight.probe", "weight.sky", "weight.none", "confidence",
+]  # fmt: skip
+Path = Annotated[str, StringConstraints(min_length=1, max_length=1024, pattern=r"^[^\x00-\x1f\x7f]+$")]
+Unit = Annotated[float, Field(ge=0.0, le=1.0)]
+Length = Annotated[float, Field(gt=0.0, le=1e9, description="in the stage's own units")]
+
+
+class Strict(BaseModel):
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
+
+
+class Override(Strict):
+    """Values of one material that win over what the stage authors."""
+
+    model: Model | None = None
+    ior: Annotated[float, Field(ge=1.0, le=10.0)] | None = None
+    thickness: Length | None = None
+    roughness: Unit | None = None
+    transmittanceColor: Annotated[list[Unit], Field(min_length=3, max_length=3)] | None = None
+    absorptionDistance: Length | None = None
+
+
+class StageOnly(Strict):
+    """`POST /v1/inspect`, `/v1/validate`."""
+
+    stage: Path | None = Field(None, description="a stage of GET /v1/stages; leave it out when a file is uploaded")
+
+
+class Render(StageOnly):
+    """`POST /v1/render`. What is left out is as the stage's own render settings say, else as on the command line."""
+
+    camera: Annotated[str, StringConstraints(max_length=1024, pattern=r"^[^\x00-\x1f\x7f]*$")] | None = None
+    image_width: Annotated[int, Field(ge=1, le=1 << 28)] | None = None
+    image_height: Annotated[int, Field(ge=0, le=1 << 28, description="0 follows the camera's aspect")] | None = None
+    samples: Annotated[int, Field(ge=1, le=4096)] | None = None
+    tiers: Annotated[list[Tier], Field(min_length=1, max_length=4)] | None = None
+    screen: Literal["march", "proxy"] | None = None
+    model: Model | None = None
+    max_layers: Annotated[int, Field(ge=1, le=32)] | None = None
+    exposure: Annotated[float, Field(ge=-64.0, le=64.0)] | None = None
+    purposes: Annotated[list[Purpose], Field(min_length=1, max_length=4)] | None = None
+    time_code: Annotated[float, Field(ge=-1e9, le=1e9)] | None = None
+    aovs: Annotated[list[Aov], Field(max_length=17)] | None = None
+    color_correction: Literal["disabled", "sRGB", "openColorIO"] | None = None
+    overrides: Annotated[dict[Path, Override], Field(max_length=256)] | None = None
+
+
+class Convert(StageOnly):
+    """`POST /v1/convert`. Answers with a .usdz, or, where JSON is accepted, with what was done."""
+
+    model: Model | None = None
+    only: Annotated[list[Path], Field(max_length=256)] | None = None
+    thickness: Literal["typed", "measured"] | None = None
+    to: Literal["preview", "openpbr", "gltf"] | None = None
+    flatten: bool | None = None
+
+
+class Warning_(BaseModel):
+    model_config = ConfigDict(title="Warning")
+    path: str
+    text: str
+
+
+class AovPicture(BaseModel):
+    name: str
+    href: str
+    white: float = Field(description="value of a white pixel; black is 0")
+
+
+class Job(BaseModel):
+    """What `GET /v1/jobs/{id}` answers."""
+
+    id: str
+    kind: Literal["render", "convert", "inspect", "validate"]
+    status: Literal["queued", "running", "done", "failed", "cancelled"]
+    fraction: float
+    stage_of_work: str
+    created: str
+    started: str | None
+    finished: str | None
+    warnings: list[Warning_]
+    width: int | None
+    height: int | None
+    aovs: list[AovPicture]
+    problem: dict[str, Any] | None
+    links: dict[str, str]
+
+
+KINDS: dict[str, type[StageOnly]] = {"render": Render, "convert": Convert, "inspect": StageOnly, "validate": StageOnly}

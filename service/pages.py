@@ -1,0 +1,43 @@
+"""Pages without scripts: /docs from the OpenAPI document, and one page per problem type."""
+
+from __future__ import annotations
+
+import json
+from html import escape
+from typing import Any
+
+from .limits import Limits, table
+from .problems import KINDS
+
+_HEAD = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
+<title>{title}</title><link rel="stylesheet" href="/static/page.css"><main>
+<h1>{title}</h1>
+"""
+
+
+def problem_page(slug: str) -> str:
+    kind = KINDS[slug]
+    return f"{_HEAD.format(title=escape(kind.title))}<p>Status {kind.status}. {escape(kind.about)}</p></main></html>"
+
+
+def docs_page(document: dict[str, Any], limits: Limits) -> str:
+    """Every operation, limit and problem type."""
+    parts = [_HEAD.format(title="refract over HTTP"), '<p>As a document: <a href="/openapi.json">openapi.json</a>.</p>',
+             "<pre>curl -F stage=@glass.usdz http://127.0.0.1:8000/v1/render -o glass.png</pre>"]  # fmt: skip
+    for path, operations in document["paths"].items():
+        for method, one in operations.items():
+            parts.append(f"<h2><code>{method.upper()} {escape(path)}</code></h2>")
+            parts.append(f"<p>{escape(one.get('description') or one.get('summary', ''))}</p>")
+            answers = ", ".join(f"{code} {escape(text['description'])}" for code, text in one["responses"].items())
+            parts.append(f"<p>Answers: {answers}</p>")
+            for media, content in one.get("requestBody", {}).get("content", {}).items():
+                schema = escape(json.dumps(content["schema"], indent=1))
+                parts.append(f"<details><summary>{escape(media)}</summary><pre>{schema}</pre></details>")
+    parts.append("<h2>Limits</h2><table><tr><th>name<th>value<th>unit<th>meaning<th>environment")
+    for row in table(limits):
+        cells = (row["name"], row["value"], row["unit"], row["meaning"], row["variable"])
+        parts.append("<tr>" + "".join(f"<td>{escape(str(cell))}" for cell in cells))
+    parts.append("</table><h2>Problems</h2><dl>")
+    for slug, kind in KINDS.items():
+        parts.append(f'<dt><a href="/problems/{slug}">{slug}</a> ({kind.status})<dd>{escape(kind.title)}')
+    return "\n".join([*parts, "</dl></main></html>"])

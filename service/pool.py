@@ -1,0 +1,147 @@
+"""Warm one-shot workers: the process that forks them, and what one of them is to the server."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import secrets
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from .worker import environment
+
+_LINE = 1 << 20
+"""Longest message of a worker [bytes]."""
+
+
+class Worker:
+    """A process that waits for its one job."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, identifier: str) -> None:
+        self.reader, self.writer, self.identifier = reader, writer, identifier
+        self.code: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+        """Exit code; negative is a signal."""
+        self.lost = False
+        """It went down with the process that forked it."""
+
+    async def give(self, job: dict[str, Any]) -> None:
+        self.writer.write(json.dumps(job, allow_nan=False).encode() + b"\n")
+        await self.writer.drain()
+
+    async def hear(self) -> dict[str, Any] | None:
+        """Next message; None when it has ended, or talks nonsense."""
+        try:
+            line = await self.reader.readuntil(b"\n")
+            message = json.loads(line)
+        except (asyncio.IncompleteReadError, asyncio.LimitOverrunError, ConnectionError, ValueError, RecursionError):
+            return None
+        return message if isinstance(message, dict) else None
+
+    def close(self) -> None:
+        self.writer.close()
+
+
+class Nursery:
+    """The process that forks workers, kept alive."""
+
+    def __init__(self) -> None:
+        self.report: dict[str, Any] = {}
+        """What confines workers on this machine; empty until the first is warm."""
+        self.ready = asyncio.Event()
+        self.restarts = -1
+        self._workers: dict[str, Worker] = {}
+        self._control: socket.socket | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._task: asyncio.Task[None] | None = None
+
+    def start(self) -> None:
+        self._task = asyncio.create_task(self._keep())
+
+    async def stop(self) -> None:
+        if self._task:
+            self._task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._task
+        self._end()
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid if self._process else 0
+
+    async def _keep(self) -> None:
+        wait = 0.1
+        while True:
+            self.restarts += 1
+            started = asyncio.get_running_loop().time()
+            try:
+                await self._run()
+            finally:
+                self.ready.clear()
+                self._end()
+            if asyncio.get_running_loop().time() - started > 60:
+                wait = 0.1
+            await asyncio.sleep(wait)
+            wait = min(wait * 2, 30.0)
+
+    async def _run(self) -> None:
+        """From start to end of one such process."""
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        ours.setblocking(False)
+        self._control = ours
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "service.worker", str(theirs.fileno())], pass_fds=[theirs.fileno()],
+                cwd=Path(__file__).parents[1], env=environment(), stdin=subprocess.DEVNULL, stdout=2,
+            )  # fmt: skip
+        loop = asyncio.get_running_loop()
+        while data := await loop.sock_recv(ours, 65536):
+            message = json.loads(data)
+            if "ready" in message:
+                self.report = message["ready"]
+                self.ready.set()
+            elif "ended" in message and (worker := self._workers.pop(message["ended"], None)):
+                worker.code.set_result(message["code"])
+
+    def _end(self) -> None:
+        if self._control:
+            self._control.close()
+            self._control = None
+        if self._process:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
+        for worker in self._workers.values():
+            if not worker.code.done():
+                worker.lost = True
+                worker.code.set_result(-9)
+        self._workers.clear()
+
+    async def fork(self) -> Worker:
+        """A new warm worker; waits until there can be one."""
+        while True:
+            await self.ready.wait()
+            ours, theirs = socket.socketpair()
+            identifier = secrets.token_hex(8)
+            with theirs:
+                try:
+                    assert self._control is not None
+                    socket.send_fds(self._control, [json.dumps({"fork": identifier}).encode()], [theirs.fileno()])
+                except (OSError, AssertionError):  # it has just ended
+                    ours.close()
+                    await asyncio.sleep(0.1)
+                    continue
+            reader, writer = await asyncio.open_connection(sock=ours, limit=_LINE)
+            worker = Worker(reader, writer, identifier)
+            self._workers[identifier] = worker
+            return worker
+
+    async def kill(self, worker: Worker) -> None:
+        if self._control and not worker.code.done():
+            with contextlib.suppress(OSError):
+                await asyncio.get_running_loop().sock_sendall(
+                    self._control, json.dumps({"kill": worker.identifier}).encode()
+                )

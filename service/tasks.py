@@ -1,0 +1,262 @@
+"""What a worker does with a stage, once it is confined: the command line's verbs, with results in a folder.
+
+Texts that leave are made for strangers: no path of this machine, and no line of a file.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from refract_core.aovs import AOVS
+from refract_core.errors import EmbreeError, ImageError, RefractError, SceneError, StageError, UsageError
+from refract_core.scene import Model, Notice, Param, Scene, Source
+
+from .problems import Problem
+
+Say = Callable[..., None]
+"""Tells the server something: `say(progress=0.5, stage="image")`, `say(path=..., warning=...)`."""
+
+_THIN = 0.005  # [m] thickness and absorption distance of the thin model
+_UNITS = ("Z", "thickness", "path_length", "layers")
+"""Planes that are not between 0 and 1: their PNG is scaled, and says by how much."""
+_SETTINGS = ("camera", "image_width", "image_height", "samples", "tiers", "screen", "model", "max_layers", "exposure",
+             "purposes")  # fmt: skip
+
+
+def perform(kind: str, stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[str, int], say: Say) -> Any:
+    """Do one job. `stage` is relative to the current folder. Returns what the job's record keeps of it.
+
+    Raises:
+        Problem: for the client.
+    """
+    from refract_core import image_files
+
+    image_files.MAX_TEXTURE_PIXELS = min(image_files.MAX_TEXTURE_PIXELS, limits["texture_pixels"])
+    try:
+        return _VERBS[kind](stage, out, settings, limits, say)
+    except StageError as error:
+        if str(error).startswith("camera ") and settings.get("camera"):
+            raise Problem("invalid-settings", _public(str(error)),
+                          errors=[{"pointer": "/camera", "detail": "the stage has no such camera"}]) from None
+        raise Problem("stage-invalid", _public(str(error))) from None
+    except UsageError as error:
+        raise Problem("invalid-settings", _public(str(error))) from None
+    except (SceneError, ImageError) as error:
+        raise Problem("stage-invalid", _public(str(error))) from None
+    except EmbreeError as error:
+        slug = "memory-limit" if "memory" in str(error) else "stage-invalid"
+        raise Problem(slug, "the scene could not be made ready for rays") from None
+    except (MemoryError, np.exceptions.AxisError) as error:
+        raise Problem("memory-limit", "the job ran out of memory") from error
+    except RefractError as error:
+        raise Problem("stage-invalid", _public(str(error))) from None
+
+
+def _public(text: str) -> str:
+    """A message without USD's own words, which quote files, and without paths of this machine."""
+    text = text.split(" cannot be read as ")[0] + " cannot be read as USD" if " cannot be read as " in text else text
+    if text.startswith("USD says:"):
+        return "USD warned about this stage; `refract render` on it shows what it said"
+    text = re.sub(r"\(recompos[^)]*\)| -- .*|\b(?:syntax|parse) error.*|\(line .*|\S*pxrInternal\S*.*", "", text).strip()
+    for folder in sorted({os.getcwd(), os.path.realpath("."), os.path.dirname(os.getcwd())}, key=len, reverse=True):
+        text = text.replace(folder + os.sep, "")
+    for known in (os.path.expanduser("~"), os.path.dirname(os.path.dirname(__file__))):
+        text = text.replace(known, "")
+    return text[:500]
+
+
+def _tell(notices: tuple[Notice, ...] | list[Notice], say: Say, limits: Mapping[str, int]) -> None:
+    once = dict.fromkeys((_public(notice.path), _public(notice.text)) for notice in notices)
+    for path, text in list(once)[: limits["warnings"]]:
+        say(path=path, warning=text)
+
+
+# --- render ---------------------------------------------------------------------------------------------------------
+
+
+def _render(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[str, int], say: Say) -> Any:
+    from refract_core.camera import image_size
+    from refract_core.render import choose_camera, render
+    from refract_core.settings import RenderSettings
+    from refract_core.usd.settings import read_settings
+    from refract_core.usd.stage import open_stage, scene_from_stage
+
+    say(progress=0.0, stage="reading the stage")
+    opened = open_stage(stage)
+    found: list[Notice] = []
+    chosen: dict[str, Any] = dict(read_settings(opened, "", found))
+    asked = {name: settings[name] for name in _SETTINGS if settings.get(name) is not None}
+    if "image_width" in asked and "image_height" not in asked:
+        chosen["image_height"] = 0
+    chosen.update({name: tuple(value) if isinstance(value, list) else value for name, value in asked.items()})
+    wanted = RenderSettings(**chosen, jobs=settings["threads"])
+    scene = scene_from_stage(
+        opened, time_code=settings.get("time_code"), purposes=wanted.purposes, camera=wanted.camera
+    )
+    _check_scene(scene, limits)
+    width, height = image_size(choose_camera(scene, wanted.camera), wanted.image_width, wanted.image_height)
+    _check_size(width, height, wanted.samples, limits)
+    scene = override(scene, settings.get("overrides") or {})
+    told = [*found, *scene.notices]
+    frame = render(scene, wanted, progress=lambda share, work: say(progress=share, stage=work))
+    _tell([*told, *frame.notices], say, limits)
+    correction = settings.get("color_correction") or "sRGB"
+    aovs = settings.get("aovs") or []
+    extension = settings["format"]
+    frame = replace(frame, metadata={**frame.metadata, "refract:stage": os.path.basename(stage)})
+    frame.save(os.path.join(out, f"image.{extension}"), aovs=aovs if extension == "exr" else (),
+               color_correction=correction)  # fmt: skip
+    kept = []
+    for name in aovs:
+        if name == "P":  # no picture holds positions
+            continue
+        white = 1.0
+        if name in _UNITS:
+            plane = frame.planes[name]
+            finite = plane[np.isfinite(plane)]
+            white = max(float(finite.max()) if finite.size else 1.0, 1e-9)
+            shown = replace(frame, planes={name: (plane / np.float32(white)).astype(np.float32)})
+        else:
+            shown = frame
+        shown.save(os.path.join(out, f"aov.{name}.png"), aovs=[name], color_correction=correction)
+        kept.append({"name": name, "white": white})
+    return {"width": frame.width, "height": frame.height, "aovs": kept}
+
+
+def _check_scene(scene: Scene, limits: Mapping[str, int]) -> None:
+    triangles = sum(len(mesh.triangles) for mesh in scene.meshes)
+    if triangles > limits["triangles"]:
+        raise Problem("limit-exceeded", f"the stage has {triangles} triangles; the limit is {limits['triangles']}")
+
+
+def _check_size(width: int, height: int, samples: int, limits: Mapping[str, int]) -> None:
+    asked = {"pixels": width * height, "samples": samples, "pixel_samples": width * height * samples}
+    for name, value in asked.items():
+        if value > limits[name]:
+            what = f"{width} x {height} pixels with {samples} samples"
+            raise Problem("limit-exceeded", f"{what}: {name} would be {value}; the limit is {limits[name]}")
+
+
+def override(scene: Scene, overrides: Mapping[str, Mapping[str, Any]]) -> Scene:
+    """The scene with other values in some materials.
+
+    Args:
+        overrides: path of a material, or of a mesh or sphere bound to it -> fields to replace. Lengths in scene units.
+
+    Raises:
+        Problem: a path names no refractive material.
+    """
+    materials = list(scene.materials)
+    for path, changes in overrides.items():
+        bound = {int(index) for mesh in scene.meshes if mesh.path == path for index in mesh.materials}
+        bound |= {sphere.material for sphere in scene.spheres if sphere.path == path}
+        chosen = bound or {index for index, material in enumerate(materials) if material.name == path}
+        if not chosen:
+            raise Problem("invalid-settings", "an override names nothing that is drawn; see /v1/inspect", prim=path,
+                          errors=[{"pointer": f"/overrides/{pointer(path)}", "detail": "no material and no shape"}])
+        names = {materials[index].name for index in chosen}
+        for index, material in enumerate(materials):
+            if index in chosen or material.name in names:
+                materials[index] = _overridden(material, changes, scene.metres_per_unit)
+    return replace(scene, materials=tuple(materials))
+
+
+def pointer(text: str) -> str:
+    """One step of a JSON pointer (RFC 6901)."""
+    return text.replace("~", "~0").replace("/", "~1")
+
+
+def _overridden(material: Any, changes: Mapping[str, Any], unit: float) -> Any:
+    inputs = list(material.inputs)
+
+    def put(param: Param, *value: float) -> None:
+        x, y, z = value if len(value) == 3 else value * 3
+        inputs[param] = Source(value=(x, y, z, 1.0 if len(value) == 3 else x))
+
+    if changes.get("ior") is not None:
+        put(Param.IOR, changes["ior"])
+    if changes.get("roughness") is not None:
+        put(Param.ROUGHNESS, changes["roughness"])
+    if changes.get("transmittanceColor") is not None:
+        put(Param.TRANSMITTANCE, *changes["transmittanceColor"])
+    if changes.get("thickness") is not None:
+        put(Param.THICKNESS, changes["thickness"] * unit)
+    distance = material.absorption_distance
+    if changes.get("absorptionDistance") is not None:
+        distance = changes["absorptionDistance"] * unit
+    model = Model[changes["model"].upper()] if changes.get("model") else material.model
+    if changes.get("model") and not material.refractive and model is not Model.NONE:
+        put(Param.OPACITY, 0.0)  # it had no opacity of glass to begin with
+    if model is Model.THIN:
+        put(Param.THICKNESS, _THIN)
+        distance = _THIN
+    return replace(material, inputs=tuple(inputs), model=model, absorption_distance=distance)
+
+
+# --- the other verbs ------------------------------------------------------------------------------------------------
+
+
+def _inspect(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[str, int], say: Say) -> Any:
+    from refract_core import inspect as room
+
+    report = room.inspect(stage)
+    _write(out, _clean(report))
+    return {}
+
+
+def _validate(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[str, int], say: Say) -> Any:
+    from refract_core import validate as room
+
+    verdict = room.validate(room.ValidateOrder(stage=stage))
+    _write(out, _clean(json.loads(room.to_json(verdict))))
+    return {}
+
+
+def _convert(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[str, int], say: Say) -> Any:
+    from refract_core.convert import ConvertOrder, convert
+    from refract_core.usd import write
+
+    from .precheck import without_places
+
+    save = write.save
+    write.save = lambda layer, out: save(without_places(layer), out)  # this process makes one file, for a stranger
+
+    order = ConvertOrder(
+        stage=stage, out=os.path.join(out, "converted.usdz"), flatten=bool(settings.get("flatten")),
+        model=settings.get("model") or "", only=tuple(settings.get("only") or ()),
+        thickness=settings.get("thickness") or "typed", to=settings.get("to") or "",
+    )  # fmt: skip
+    done = convert(order, lambda share, work: say(progress=share, stage=work))
+    _tell(done.notices, say, limits)
+    _write(out, _clean({
+        "stage": stage, "out": "converted.usdz", "materials": [asdict(row) for row in done.rows],
+        "notices": [asdict(notice) for notice in done.notices],
+    }))  # fmt: skip
+    return {}
+
+
+def _clean(value: Any) -> Any:
+    """Every text in a report, for strangers; numbers that JSON does not have are null."""
+    if isinstance(value, str):
+        return _public(value)
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    if isinstance(value, Mapping):
+        return {str(key): _clean(inner) for key, inner in value.items()}
+    return [_clean(inner) for inner in value] if isinstance(value, list | tuple) else value
+
+
+def _write(out: str, report: Any) -> None:
+    with open(os.path.join(out, "report.json"), "w", encoding="utf-8") as file:
+        json.dump(report, file, allow_nan=False, indent=2)
+
+
+_VERBS = {"render": _render, "inspect": _inspect, "validate": _validate, "convert": _convert}
+assert set(_UNITS) <= AOVS.keys()

@@ -1,0 +1,235 @@
+"""The process that is never given a stage, and its children, which are given one each.
+
+`python -m service.worker FD` loads everything once (imports, compiled kernels), with a single thread, and then forks
+at the server's word: a fork of it is warm at once. A child waits on its own socket for one job, locks itself into the
+job's folder, and only then opens the stage. Nothing a child does comes back to its parent but its exit code.
+
+Messages are JSON. Server to this process: {"fork": id} with a socket, {"kill": id}; back: {"ready": ...},
+{"ended": id, "code": n}. Server to a child: one line, the job; back: `began`, lines of progress and warnings, and one
+of `done` or `problem`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import socket
+import sys
+import tempfile
+import traceback
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from . import confine
+
+_QUIET = {"PXR_WORK_THREAD_LIMIT": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENIMAGEIO_THREADS": "1",
+          "PXR_AR_DISABLE_PLUGIN_RESOLVER": "1", "PXR_AR_DISABLE_PLUGIN_URI_RESOLVERS": "1",
+          "TF_ENV_SETTING_ALERTS_ENABLED": "0"}  # fmt: skip
+_UNSET = ("PXR_PLUGINPATH_NAME", "PXR_AR_DEFAULT_SEARCH_PATH", "OCIO", "PYTHONSTARTUP")
+
+
+def environment() -> dict[str, str]:
+    """Variables of the worker: libraries without threads of their own, no plug-ins, no secrets of the server."""
+    kept = {key: value for key, value in os.environ.items() if key not in _UNSET and not key.startswith("REFRACT_")}
+    if "REFRACT_CACHE_DIR" in os.environ:
+        kept["REFRACT_CACHE_DIR"] = os.environ["REFRACT_CACHE_DIR"]
+    return {**kept, **_QUIET}
+
+
+def main() -> None:
+    confine.die_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the server's to handle
+    control = socket.socket(fileno=int(sys.argv[1]))
+    os.dup2(2, 1)  # libraries print
+    threads = _warm()
+    _send(control, {"ready": {**confine.available(), "threads": threads}})
+    children: dict[int, tuple[str, socket.socket]] = {}
+    wake, waker = os.pipe()
+    ears: list[Any] = [control, wake]
+    os.set_blocking(waker, False)
+    signal.signal(signal.SIGCHLD, lambda _number, _frame: None)
+    signal.set_wakeup_fd(waker)
+    while True:
+        readable, _, _ = select.select(ears, [], [])
+        if wake in readable:
+            os.read(wake, 4096)
+            _reap(control, children)
+        if control in readable and not _obey(control, children):
+            for pid in children:
+                os.kill(pid, signal.SIGKILL)
+            return
+
+
+def _warm() -> int:
+    """Load everything. Returns the number of threads there are then; above 1, a fork would not be safe."""
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})  # Embree starts a thread for every further core it sees
+    import refract_core.convert
+    import refract_core.inspect
+    import refract_core.usd.inspect
+    import refract_core.usd.rules_stage
+    import refract_core.usd.stage  # noqa: F401
+    import schemas
+
+    from . import precheck, tasks, warm  # noqa: F401  the first is needed once USD is open
+
+    schemas.register()
+    warm.draw()
+    os.sched_setaffinity(0, cores)
+    return len(os.listdir("/proc/self/task"))
+
+
+def _send(control: socket.socket, message: dict[str, Any]) -> None:
+    with suppress(OSError):
+        control.send(json.dumps(message).encode())
+
+
+def _reap(control: socket.socket, children: dict[int, tuple[str, socket.socket]]) -> None:
+    while children:
+        pid, status = os.waitpid(-1, os.WNOHANG)
+        if not pid:
+            return
+        identifier, _ = children.pop(pid)
+        _send(control, {"ended": identifier, "code": os.waitstatus_to_exitcode(status)})
+
+
+def _obey(control: socket.socket, children: dict[int, tuple[str, socket.socket]]) -> bool:
+    data, descriptors, _, _ = socket.recv_fds(control, 65536, 1)
+    if not data:
+        return False
+    message = json.loads(data)
+    if "kill" in message:
+        for pid, (identifier, _) in children.items():
+            if identifier == message["kill"]:
+                os.kill(pid, signal.SIGKILL)
+        return True
+    parent = os.getpid()
+    pid = os.fork()
+    if pid == 0:
+        signal.set_wakeup_fd(-1)
+        control.close()
+        _child(descriptors[0], parent)
+    os.close(descriptors[0])
+    children[pid] = (message["fork"], control)
+    return True
+
+
+def _child(descriptor: int, parent: int) -> None:
+    """One job, then the end."""
+    code = 1
+    try:
+        confine.die_with_parent()
+        if os.getppid() == parent:
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+            code = _serve(descriptor)
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def _serve(descriptor: int) -> int:
+    with os.fdopen(descriptor, "rb", closefd=False) as file:
+        line = file.readline()
+    if not line:
+        return 0
+    job = json.loads(line)
+    os.write(descriptor, b'{"began": true}\n')
+
+    def say(**message: Any) -> None:
+        data = json.dumps(message, allow_nan=False).encode() + b"\n"
+        while data:
+            data = data[os.write(descriptor, data) :]
+
+    from .problems import Problem
+
+    try:
+        say(done=_perform(job, say))
+    except Problem as problem:
+        say(problem={"slug": problem.slug, "detail": problem.detail, "errors": problem.errors, "prim": problem.prim})
+    except UnicodeDecodeError:  # what USD says of a damaged file may hold pieces of it
+        say(problem={"slug": "stage-invalid", "detail": "the stage cannot be read as USD", "errors": [], "prim": ""})
+    except MemoryError:
+        say(problem={"slug": "memory-limit", "detail": "the job ran out of memory", "errors": [], "prim": ""})
+    return 0
+
+
+def _perform(job: dict[str, Any], say: Any) -> Any:
+    """Lock this process in, check what the stage names, do the job."""
+    from . import precheck, tasks
+    from .problems import Problem
+
+    limits, root, folder = job["limits"], os.path.realpath(job["root"]), os.path.realpath(job["folder"])
+    out, scratch = os.path.join(folder, "out"), os.path.join(folder, "tmp")
+    os.environ["TMPDIR"] = tempfile.tempdir = scratch
+    os.chdir(root)
+    sys.path[:] = [place for place in sys.path if place]
+    _say_to(os.path.join(folder, "worker.log"))
+    _no_new_kernels()
+    means = confine.Means(
+        limits["memory_bytes"], limits["cpu_seconds"], limits["result_bytes"], limits["open_files"]
+    )
+    confine.confine([*_own_files(), root], [out, scratch], means)
+    if job.get("forbidden"):  # for tests: prove that the lock holds
+        return _try_to_escape(job["forbidden"])
+    try:
+        precheck.check_stage(job["stage"], root, layers=limits["layers"], unpacked_bytes=limits["stage_bytes"])
+    except precheck.TooMany as error:
+        raise Problem("limit-exceeded", str(error)) from None
+    except precheck.Refused as error:
+        raise Problem("stage-refused", str(error)) from None
+    return tasks.perform(job["kind"], job["stage"], out, job["settings"], limits, say)
+
+
+def _own_files() -> list[str]:
+    """What the program itself is made of, and nothing else of the machine."""
+    from refract_core.kernel import cache_root
+
+    here = Path(__file__).resolve().parents[1]
+    own = [str(here / name) for name in ("refract_core", "schemas", "service")]
+    system = ["/usr/lib", "/lib", "/lib64", "/etc/ld.so.cache", "/dev/null", "/dev/urandom", "/proc/cpuinfo",
+              "/proc/meminfo", "/sys/devices/system/cpu"]  # fmt: skip
+    return [*own, str(cache_root()), *{sys.prefix, sys.base_prefix}, *system]
+
+
+def _say_to(path: str) -> None:
+    """What libraries print belongs to the job, not to the server's log."""
+    log = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
+    os.dup2(log, 1)
+    os.dup2(log, 2)
+    os.close(log)
+
+
+def _no_new_kernels() -> None:
+    """A kernel compiled here is not kept: the cache is code, and this process must not be able to write it."""
+    from numba.core import caching
+
+    caching.IndexDataCacheFile.save = lambda *_arguments: None
+
+
+def _try_to_escape(path: str) -> dict[str, str]:
+    tried: dict[str, Any] = {
+        "read": lambda: open(path).close(),
+        "write": lambda: open(path + ".new", "w").close(),
+        "socket": lambda: socket.socket().close(),
+        "execute": lambda: os.execv("/bin/true", ["true"]),
+        "fork": os.fork,
+        "signal": lambda: os.kill(os.getppid(), 0),
+    }
+    found = {}
+    for name, attempt in tried.items():
+        try:
+            if attempt() == 0 and name == "fork":
+                os._exit(0)
+            found[name] = "allowed"
+        except OSError as error:
+            found[name] = str(error.strerror)
+    return found
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,311 @@
+"""The page in a real browser, against tests/fake_service.py. Skipped where Playwright or Chromium is not installed."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from subprocess import PIPE, Popen
+from typing import Any
+
+import pytest
+from fake_service import FakeService
+
+playwright = pytest.importorskip("playwright.sync_api")
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+if CHROMIUM is None:
+    pytest.skip("Chromium is not installed", allow_module_level=True)
+
+MIDDLE = "id => [...document.getElementById(id).getContext('2d').getImageData(32, 18, 1, 1).data]"
+CONTROLS = r"^\s*- (button|textbox|combobox|slider|spinbutton|checkbox|radio|progressbar)\b(?! \")"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with playwright.sync_playwright() as driver:
+        opened = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield opened
+        opened.close()
+
+
+@pytest.fixture
+def service() -> Iterator[FakeService]:
+    with FakeService(seconds=0.2) as running:
+        yield running
+
+
+@pytest.fixture
+def page(browser: Any, service: FakeService) -> Iterator[Any]:
+    """A fresh page at the service; an uncaught error or a breach of the content policy fails the test."""
+    context = browser.new_context(viewport={"width": 1200, "height": 900})
+    context.set_default_timeout(10_000)
+    opened = context.new_page()
+    wrong: list[str] = []
+    opened.on("pageerror", lambda error: wrong.append(str(error)))
+    opened.on("console", lambda line: wrong.append(line.text) if line.type == "error" else None)
+    opened.goto(service.url)
+    yield opened
+    context.close()
+    assert [line for line in wrong if "Failed to load resource" not in line] == []
+
+
+def status(page: Any, text: str) -> None:
+    playwright.expect(page.locator("#status")).to_have_text(text)
+
+
+def pick(page: Any, name: str = "ball.usda") -> None:
+    page.get_by_label("Or a sample").select_option(name)
+    status(page, "Done.")
+    page.wait_for_selector("#canvas-a:visible")
+
+
+def asked(service: FakeService) -> Any:
+    """Settings of the newest render, without what the page always asks for."""
+    settings = dict(service.asked("POST", "/v1/render")[-1])
+    assert "thickness" in settings.pop("aovs")
+    return settings
+
+
+def test_upload_render_and_change_a_slider(page: Any, service: FakeService) -> None:
+    page.get_by_label("Drop a USD file here").set_input_files(
+        {"name": "mine.usdz", "mimeType": "model/vnd.usdz+zip", "buffer": b"anything"}
+    )
+    status(page, "Done.")
+    page.wait_for_selector("#canvas-a:visible")
+    assert asked(service) == {"stage": "mine.usdz", "image_width": 480}
+    before = page.evaluate(MIDDLE, "canvas-a")
+    page.get_by_label("Ball: Index of refraction, slider").press("ArrowRight")
+    page.wait_for_function(f"before => String(({MIDDLE})('canvas-a')) !== String(before)", arg=before)
+    assert asked(service)["overrides"] == {"/World/Looks/Ball": {"ior": 1.51}}
+    assert page.locator("#glass-0-ior").input_value() == "1.51"
+    assert page.get_by_role("img").get_attribute("aria-label") == "picture of mine.usdz, setting A, 64 by 36 pixels"
+
+
+def test_a_file_can_be_dropped_anywhere(page: Any, service: FakeService) -> None:
+    page.evaluate("""() => {
+        const data = new DataTransfer();
+        data.items.add(new File(['x'], 'dropped.usda'));
+        document.body.dispatchEvent(new DragEvent('drop', {dataTransfer: data, bubbles: true, cancelable: true}));
+    }""")
+    status(page, "Done.")
+    assert asked(service)["stage"] == "dropped.usda"
+
+
+def test_progress_is_told_and_cancel_ends_the_job(page: Any, service: FakeService) -> None:
+    service.seconds = 60.0
+    page.get_by_label("Or a sample").select_option("ball.usda")
+    status(page, "Rendering, 0 %.")
+    assert page.get_by_role("progressbar").is_visible()
+    page.get_by_role("button", name="Cancel").click()
+    status(page, "Cancelled.")
+    assert page.evaluate("document.activeElement.id") == "render"
+    (job,) = service.jobs.values()
+    for _ in range(100):
+        if job.cancelled:
+            break
+        page.wait_for_timeout(20)
+    assert job.cancelled
+    service.seconds = 0.1
+    page.get_by_role("button", name="Render", exact=True).click()
+    status(page, "Done.")
+
+
+def test_a_changed_mind_leaves_no_job_behind(page: Any, service: FakeService) -> None:
+    service.seconds = 60.0
+    page.get_by_label("Or a sample").select_option("ball.usda")
+    status(page, "Rendering, 0 %.")
+    service.seconds = 0.1
+    page.get_by_label("Camera", exact=True).select_option("/World/Far")
+    status(page, "Done.")
+    assert [job.cancelled for job in service.jobs.values()] == [True, False]
+
+
+def test_a_refusal_names_the_field_and_leads_to_it(page: Any) -> None:
+    pick(page)
+    page.get_by_label("Samples per pixel").fill("2000")
+    alert = page.get_by_role("alert")
+    playwright.expect(alert).to_contain_text("The settings are not valid")
+    playwright.expect(alert).to_contain_text("must be at most 1000")
+    assert page.locator("#set-samples").get_attribute("aria-invalid") == "true"
+    alert.get_by_role("link", name="/samples").click()
+    assert page.evaluate("document.activeElement.id") == "set-samples"
+    page.get_by_label("Samples per pixel").fill("8")
+    status(page, "Done.")
+    assert alert.is_hidden()
+    assert page.locator("#set-samples").get_attribute("aria-invalid") is None
+
+
+def test_a_failed_job_shows_its_problem_and_keeps_the_last_picture(page: Any) -> None:
+    pick(page)
+    page.get_by_label("Layers of glass").fill("13")
+    status(page, "Failed.")
+    alert = page.get_by_role("alert")
+    for part in ("The renderer crashed", "Too deep.", "Prim: /World/Ball"):
+        playwright.expect(alert).to_contain_text(part)
+    assert page.locator("#canvas-a.old").is_visible()
+
+
+def test_a_stage_that_cannot_be_opened_is_said_to_be_so(page: Any) -> None:
+    page.get_by_label("Drop a USD file here").set_input_files(
+        {"name": "broken.usda", "mimeType": "text/plain", "buffer": b"no"}
+    )
+    playwright.expect(page.get_by_role("alert")).to_contain_text("broken.usda is not a USD file.")
+    assert page.get_by_role("button", name="Render", exact=True).is_disabled()
+
+
+def test_two_settings_and_one_slider(page: Any, service: FakeService) -> None:
+    pick(page)
+    page.get_by_label("Ready-made comparison").select_option("model")
+    page.wait_for_selector("#canvas-b:visible")
+    models = [body.get("model") for body in service.asked("POST", "/v1/render")]
+    assert models == [None, "sphere", "traced"]
+    slider = page.get_by_label("Compare: A to the left")
+    slider.press("ArrowLeft")
+    assert slider.get_attribute("aria-valuetext") == "A on the left 49 %, B on the right 51 %"
+    assert "49%" in page.locator("#canvas-b").evaluate("node => node.style.clipPath")
+    box = page.locator("#views").bounding_box()
+    page.mouse.click(box["x"] + box["width"] * 0.25, box["y"] + 20)
+    assert slider.input_value() == "25"
+    page.get_by_label("Edit B").check()
+    page.get_by_label("Samples per pixel").fill("7")
+    status(page, "A done; B done.")
+    assert asked(service) == {"stage": "ball.usda", "image_width": 480, "model": "traced", "samples": 7}
+    page.get_by_label("Compare A with B").uncheck()
+    assert page.locator("#canvas-b").is_hidden()
+
+
+def test_planes_come_in_false_colour_with_a_legend(page: Any) -> None:
+    pick(page)
+    page.get_by_label("Show").select_option("thickness")
+    playwright.expect(page.locator("#legend")).to_contain_text("1.24 m")  # white, as the job's record says
+    page.wait_for_function(f"() => ({MIDDLE})('canvas-a')[0] !== 0")
+    expected = page.evaluate("async () => (await import('/static/page.js')).falseColour(64 / 255)")
+    assert page.evaluate(MIDDLE, "canvas-a")[:3] == expected
+    page.get_by_label("Show").select_option("picture")
+    playwright.expect(page.locator("#legend")).to_be_hidden()
+
+
+def test_tier_order_by_keyboard(page: Any, service: FakeService) -> None:
+    pick(page)
+    page.get_by_role("button", name="Move probe up").press("Enter")
+    playwright.expect(page.locator("#tiers li").first).to_contain_text("1. probe")
+    assert page.evaluate("document.activeElement.id") == "tier-probe"  # up is off now; the row keeps the focus
+    page.get_by_label("ray (not asked)").press(" ")
+    status(page, "Done.")
+    assert asked(service)["tiers"] == ["probe", "screen", "sky", "ray"]
+
+
+def test_tier_order_by_dragging(page: Any, service: FakeService) -> None:
+    pick(page)
+    page.locator("#tiers li").nth(2).drag_to(page.locator("#tiers li").nth(0))
+    playwright.expect(page.locator("#tiers li").first).to_contain_text("1. sky")
+    status(page, "Done.")
+    assert asked(service)["tiers"] == ["sky", "screen", "probe"]
+
+
+def test_a_link_opens_the_same_view(page: Any, service: FakeService) -> None:
+    pick(page, "room.usda")
+    page.get_by_role("group", name="Ball").get_by_label("Absorption colour").check()
+    page.locator("#glass-0-transmittanceColor").fill("#ff0000")
+    page.get_by_label("Ready-made comparison").select_option("screen")
+    page.wait_for_selector("#canvas-b:visible")
+    page.get_by_role("button", name="Copy link").click()
+    link = page.get_by_label(re.compile("^Link")).input_value()
+    other = page.context.new_page()
+    other.goto(link)
+    other.wait_for_selector("#canvas-b:visible")
+    assert other.locator("#sample").input_value() == "room.usda"
+    assert other.locator("#glass-0-transmittanceColor").input_value() == "#ff0000"
+    assert asked(service)["overrides"] == {"/World/Looks/Ball": {"transmittanceColor": [1, 0, 0]}}
+    assert len(service.jobs) == 3  # the link's two renders are those that were there: same request, same job
+
+
+def test_commands_are_copied(page: Any) -> None:
+    pick(page)
+    page.get_by_role("button", name="Copy as curl").click()
+    assert page.locator("#copied").input_value().startswith("curl ")
+    page.get_by_role("button", name="Copy as CLI").click()
+    assert page.locator("#copied").input_value() == "refract render ball.usda ball.png --image-width 480"
+    assert page.evaluate("document.activeElement.id") == "copied"
+
+
+def test_a_token_is_asked_for_where_one_is_needed(page: Any, service: FakeService) -> None:
+    service.token = "secret"
+    page.reload()
+    page.get_by_label("Access token").fill("secret")
+    page.get_by_label("Access token").press("Enter")
+    pick(page)
+    assert "secret" not in page.url
+
+
+def test_text_of_a_stage_is_never_markup(page: Any) -> None:
+    pick(page)
+    page.get_by_text("Notices (2)").click()
+    playwright.expect(page.locator("#notices-list")).to_contain_text("<b>odd</b>")
+    assert page.locator("#notices-list b").count() == 0
+
+
+def test_every_control_has_a_name_for_a_screen_reader(page: Any) -> None:
+    pick(page)
+    page.get_by_label("Ready-made comparison").select_option("model")
+    page.wait_for_selector("#canvas-b:visible")
+    page.evaluate("for (const node of document.querySelectorAll('details')) node.open = true")
+    lines = page.locator("body").aria_snapshot().splitlines()
+    assert len([line for line in lines if re.match(r"^\s*- (button|slider|spinbutton)", line)]) > 20
+    assert [line for line in lines if re.match(CONTROLS, line)] == []
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_it_fits_a_narrow_screen(page: Any, scheme: str) -> None:
+    page.set_viewport_size({"width": 360, "height": 740})
+    page.emulate_media(color_scheme=scheme)
+    pick(page)
+    page.get_by_label("Ready-made comparison").select_option("model")
+    page.wait_for_selector("#canvas-b:visible")
+    page.evaluate("for (const node of document.querySelectorAll('details')) node.open = true")
+    assert page.evaluate("document.documentElement.scrollWidth") == 360
+
+
+# --- the service itself ---------------------------------------------------------------------------------------------
+
+SERVE = """
+import sys
+from service.app import Settings
+from service.serve import serve
+serve(Settings(stage_root=sys.argv[1], data=sys.argv[2], workers=1), "127.0.0.1", 0)
+"""
+
+
+@pytest.fixture
+def real_url(tmp_path: Path) -> Iterator[str]:
+    """Address of the real service over the good samples."""
+    pytest.importorskip("service.serve")
+    root = Path(__file__).parents[1]
+    command = [sys.executable, "-c", SERVE, str(root / "usd_samples" / "good"), str(tmp_path)]
+    with Popen(command, stdout=PIPE, text=True, cwd=root) as process:
+        assert process.stdout is not None
+        said = next(line for line in process.stdout if "http://" in line)
+        yield said[said.index("http://") :].strip()
+        process.terminate()
+        process.wait(60)
+
+
+def test_against_the_real_service(browser: Any, real_url: str) -> None:
+    opened = browser.new_page()
+    opened.set_default_timeout(30_000)
+    opened.goto(f'{real_url}#stage=marble.usda&a={{"image_width":64,"samples":1}}')
+    done = lambda: playwright.expect(opened.locator("#status")).to_have_text("Done.", timeout=400_000)  # noqa: E731
+    done()  # the first worker may have to compile its kernels
+    opened.wait_for_selector("#canvas-a:visible")
+    assert opened.evaluate("document.getElementById('canvas-a').width") == 64
+    before = opened.evaluate(MIDDLE, "canvas-a")
+    opened.get_by_label("Clear: Index of refraction, slider").fill("1.05")
+    opened.wait_for_function(f"before => String(({MIDDLE})('canvas-a')) !== String(before)", arg=before)
+    done()
+    opened.get_by_label("Show").select_option("thickness")
+    playwright.expect(opened.locator("#legend")).to_contain_text("1.24 m")
+    opened.get_by_label("Samples per pixel").fill("4096")
+    playwright.expect(opened.get_by_role("alert")).to_contain_text("limit")
+    opened.close()

@@ -1,0 +1,221 @@
+"""The service as a client meets it: a real process, real sockets, real renders."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from pxr import Usd
+from service_server import BALL, ROOT, SMALL, Server, running, until, upload
+
+from refract_core.image import read_texture
+
+GOOD = ROOT / "usd_samples" / "good"
+SLOW = {"stage": "marble.usda", "image_width": 640, "samples": 16}
+"""Seconds of work, to have time to do something meanwhile."""
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    data = tmp_path_factory.mktemp("service") / "data"
+    with running(data, "--stage-root", str(GOOD), "--workers", "1", "--queue", "1") as server:
+        yield server
+
+
+@pytest.fixture
+def client(server: Server) -> Iterator[httpx.Client]:
+    with server.client() as client:
+        yield client
+    server.idle()
+
+
+def post(client: httpx.Client, verb: str = "render", stage: str = BALL, **settings: Any) -> httpx.Response:
+    chosen = {**SMALL, **settings} if verb == "render" else settings
+    return client.post(f"/v1/{verb}", files=upload(stage), data={"settings": json.dumps(chosen)})
+
+
+def pixels_of(content: bytes) -> Any:
+    return read_texture(content, name="picture", color_space="auto").pixels
+
+
+def test_an_upload_becomes_the_picture_that_the_command_line_makes(client: httpx.Client, tmp_path: Path) -> None:
+    from refract_core.progress import reporting
+    from refract_core.sequence import Order, render_files
+
+    answer = post(client)
+    assert answer.status_code == 200
+    assert answer.headers["content-type"] == "image/png"
+    (tmp_path / "stage.usda").write_text(BALL)
+    order = Order(stage=str(tmp_path / "stage.usda"), out=str(tmp_path / "out.png"), overrides=SMALL)
+    with reporting("none") as report:
+        render_files(order, report, lambda: False)
+    np.testing.assert_array_equal(pixels_of(answer.content), pixels_of((tmp_path / "out.png").read_bytes()))
+
+
+def test_accept_chooses_the_format(client: httpx.Client) -> None:
+    answer = client.post("/v1/render", json={"stage": "traced.usda", **SMALL}, headers={"Accept": "image/x-exr"})
+    assert answer.headers["content-type"] == "image/x-exr"
+    assert answer.content.startswith(b"\x76\x2f\x31\x01")
+    assert str(ROOT).encode() not in answer.content
+    refused = client.post("/v1/render", json={"stage": "traced.usda"}, headers={"Accept": "image/gif"})
+    assert refused.status_code == 406
+
+
+def test_the_same_request_is_the_same_job(client: httpx.Client) -> None:
+    first, second = post(client, exposure=1.0), post(client, exposure=1.0)
+    assert first.headers["etag"] == second.headers["etag"]
+    assert first.content == second.content
+    assert post(client, exposure=2.0).headers["etag"] != first.headers["etag"]
+    where, tag = first.headers["content-location"], first.headers["etag"]
+    assert not tag.startswith("W/")
+    assert client.get(f"{where}/image").headers["etag"] == tag
+    unchanged = client.get(f"{where}/image", headers={"If-None-Match": f'"other", {tag}'})
+    assert (unchanged.status_code, unchanged.content) == (304, b"")
+    assert client.get(f"{where}/image", headers={"If-None-Match": '"other"'}).status_code == 200
+
+
+def test_a_job_tells_its_progress_and_keeps_its_results(client: httpx.Client) -> None:
+    settings = {**SMALL, "aovs": ["thickness", "weight.probe"], "exposure": 0.25}
+    body = {"files": upload(BALL), "data": {"settings": json.dumps(settings)}}
+    accepted = client.post("/v1/render", **body, headers={"Prefer": "respond-async"})  # type: ignore[arg-type]
+    assert accepted.status_code == 202
+    where = accepted.headers["location"]
+    with client.stream("GET", f"{where}/events") as stream:
+        assert stream.headers["content-type"].startswith("text/event-stream")
+        lines = list(stream.iter_lines())
+    events = [line.removeprefix("event: ") for line in lines if line.startswith("event: ")]
+    assert events[-1] == "done"
+    assert set(events[:-1]) <= {"progress"}
+    job = client.get(where).json()
+    assert json.loads(lines[-2].removeprefix("data: ")) == job
+    assert (job["status"], job["fraction"], job["width"]) == ("done", 1.0, 32)
+    assert [aov["name"] for aov in job["aovs"]] == settings["aovs"]
+    thickness = job["aovs"][0]
+    pixels = pixels_of(client.get(thickness["href"]).content)[..., 0]
+    assert thickness["white"] == pytest.approx(2.0)  # the ball's, in metres
+    assert pixels.max() == 255
+    assert client.get(f"{where}/aovs/Z.png").status_code == 404
+    assert client.delete(where).json()["status"] == "done"
+
+
+def test_overrides_change_one_material(client: httpx.Client) -> None:
+    plain = post(client).content
+    other = post(client, overrides={"/World/Glass": {"model": "traced", "ior": 1.2, "roughness": 0.0}})
+    assert other.status_code == 200
+    assert other.content != plain
+    same = post(client, overrides={"/World/Ball": {"ior": 1.5, "thickness": 2.0}})  # what the stage says anyway
+    np.testing.assert_array_equal(pixels_of(same.content), pixels_of(plain))
+    unknown = post(client, overrides={"/World/Nothing": {"ior": 1.2}}).json()
+    assert unknown["prim"] == "/World/Nothing"
+    assert unknown["errors"][0]["pointer"] == "/overrides/~1World~1Nothing"
+
+
+def test_inspect_and_validate_answer_as_the_command_line(client: httpx.Client, tmp_path: Path) -> None:
+    from refract_core.inspect import inspect
+    from refract_core.validate import ValidateOrder, to_json, validate
+
+    seen = client.post("/v1/inspect", json={"stage": "marble.usda"}).json()
+    assert seen == {**inspect(str(GOOD / "marble.usda")), "stage": "marble.usda"}
+    found = client.post("/v1/validate", json={"stage": "marble.usda"}).json()
+    theirs = json.loads(to_json(validate(ValidateOrder(stage=str(GOOD / "marble.usda")))))
+    assert [one["rule"] for one in found["findings"]] == [one["rule"] for one in theirs["findings"]]
+
+
+@pytest.mark.parametrize("flatten", [False, True])
+def test_convert_gives_a_package_without_paths_of_ours(client: httpx.Client, tmp_path: Path, flatten: bool) -> None:
+    body = {"stage": "preview_surface.usda", "flatten": flatten}
+    answer = client.post("/v1/convert", json=body)
+    assert answer.headers["content-type"] == "model/vnd.usdz+zip", answer.text
+    (tmp_path / "c.usdz").write_bytes(answer.content)
+    stage = Usd.Stage.Open(str(tmp_path / "c.usdz"))
+    assert any("RefractMaterialAPI" in prim.GetAppliedSchemas() for prim in stage.Traverse())
+    text = "".join(layer.ExportToString() for layer in stage.GetUsedLayers(includeClipLayers=False))
+    assert str(ROOT) not in text
+    assert str(tmp_path.parents[0]) not in text.replace(str(tmp_path), "")
+    report = client.post("/v1/convert", json=body, headers={"Accept": "application/json"}).json()
+    assert report["materials"]
+
+
+def test_cancel_kills_the_process(client: httpx.Client, server: Server) -> None:
+    job = client.post("/v1/render", json=SLOW, headers={"Prefer": "respond-async"})
+    where = job.headers["location"]
+    until(lambda: client.get(where).json()["fraction"] > 0.0)
+    before = server.workers()
+    cancelled = client.delete(where).json()
+    assert cancelled["status"] == "cancelled"
+    assert cancelled["problem"]["type"] == "/problems/cancelled"
+    until(lambda: not set(before) & set(server.workers()), 5.0)
+    assert client.get(f"{where}/image").status_code == 409
+    with client.stream("GET", f"{where}/events") as stream:
+        assert next(stream.iter_lines()) == "event: cancelled"
+    assert post(client).status_code == 200
+
+
+def test_who_leaves_cancels_what_only_they_waited_for(client: httpx.Client, server: Server) -> None:
+    with server.connect() as connection:
+        body = json.dumps({**SLOW, "exposure": 0.5}).encode()
+        head = "POST /v1/render HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+        connection.sendall(f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body)
+        until(lambda: server.metric("refract_jobs_running") == 1.0)
+    until(lambda: server.metric("refract_jobs_running") == 0.0, 5.0)
+
+
+def test_a_full_queue_refuses_before_it_reads(client: httpx.Client, server: Server) -> None:
+    jobs = [
+        client.post("/v1/render", json={**SLOW, "exposure": float(stop)}, headers={"Prefer": "respond-async"})
+        for stop in (3, 4)
+    ]
+    assert [job.status_code for job in jobs] == [202, 202]
+    with server.connect() as connection:
+        connection.sendall(b"POST /v1/render HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+                           b"Content-Length: 1000\r\n\r\n{")  # fmt: skip
+        answer = "".join(iter(lambda: connection.recv(4096).decode(), ""))
+    assert " 429 " in answer.splitlines()[0]
+    assert "retry-after: " in answer.lower()
+    assert "/problems/queue-full" in answer
+    for job in jobs:
+        client.delete(job.headers["location"])
+
+
+def test_the_kill_of_a_worker_fails_one_job(client: httpx.Client, server: Server) -> None:
+    job = client.post("/v1/render", json={**SLOW, "exposure": 0.75}, headers={"Prefer": "respond-async"})
+    where = job.headers["location"]
+    until(lambda: client.get(where).json()["fraction"] > 0.0)
+    for pid in server.workers():
+        os.kill(pid, signal.SIGKILL)
+    until(lambda: client.get(where).json()["status"] == "failed")
+    assert client.get(where).json()["problem"]["type"] == "/problems/stage-crashed"
+    assert post(client).status_code == 200
+
+
+def test_the_death_of_all_workers_is_survived(client: httpx.Client, server: Server) -> None:
+    os.kill(server.nursery(), signal.SIGKILL)
+    first = post(client, exposure=-1.0)
+    if first.status_code != 200:  # it had begun
+        assert (first.status_code, first.json()["type"]) == (503, "/problems/interrupted")
+    assert post(client, exposure=-1.0).status_code == 200
+
+
+def test_livez_readyz_limits_stages(client: httpx.Client) -> None:
+    assert client.get("/livez").json() == {"status": "alive"}
+    assert client.get("/readyz").json()["confinement"]["threads"] == 1
+    assert {"path": "marble.usda", "bytes": (GOOD / "marble.usda").stat().st_size} in client.get("/v1/stages").json()[
+        "stages"
+    ]
+    limits = client.get("/v1/limits").json()
+    assert {row["name"]: row["value"] for row in limits["limits"]}["samples"] == 64
+
+
+def test_an_idle_service_leaves_nothing_behind(client: httpx.Client, server: Server) -> None:
+    post(client, exposure=-2.0)
+    server.idle()
+    until(lambda: len(list((server.data / "work").iterdir())) == 1)  # of the next worker
+    until(lambda: len(server.workers()) == 1)
+    assert [path for path in server.data.rglob("stage.usd*")] == []

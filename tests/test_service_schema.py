@@ -1,0 +1,153 @@
+"""The OpenAPI document is true: requests made from it, good and bad, are answered as it says."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+from service_server import BALL, ROOT, SMALL, Server, running, upload
+
+schemathesis = pytest.importorskip("schemathesis")
+
+from schemathesis import config as options  # noqa: E402
+from schemathesis.engine import events, from_schema  # noqa: E402
+
+GOOD = ROOT / "usd_samples" / "good"
+WORK = ("render", "convert", "inspect", "validate")
+EXAMPLES = 6
+"""Random requests per operation, beside some hundred that each break one rule of the document."""
+OFF = {
+    # The document cannot say which stages there are, nor what bytes are a stage: a request that fits it may well name
+    # none (422), or upload something else (415), or pass a limit that /v1/limits alone tells. `test_well_formed...`
+    # below holds what is left of it.
+    "positive_data_acceptance": options.PositiveDataAcceptanceConfig(enabled=False),
+    # DELETE cancels a job. The job stays, and tells that it was cancelled.
+    "use_after_free": options.SimpleCheckConfig(enabled=False),
+    # No operation makes a thing whose address schemathesis could know: ids are digests of a request.
+    "ensure_resource_availability": options.SimpleCheckConfig(enabled=False),
+    # Tokens are optional and off in this service; test_service_units holds them.
+    "ignored_auth": options.SimpleCheckConfig(enabled=False),
+    "object_level_authorization": options.SimpleCheckConfig(enabled=False),
+}
+HEADERS: list[dict[str, str]] = [
+    {}, {"Accept": "application/json"}, {"Prefer": "respond-async"}, {"Accept": "image/x-exr, model/*;q=0.5"},
+    {"If-None-Match": "*"}, {"Accept": "text/nothing"}, {"Accept": ";;q=x,"},
+]  # fmt: skip
+
+
+@dataclass
+class Seen:
+    """What a run of schemathesis found."""
+
+    checks: Counter[str] = field(default_factory=Counter)
+    answers: Counter[tuple[str, int]] = field(default_factory=Counter)
+    failures: list[str] = field(default_factory=list)
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    words = ("--stage-root", str(GOOD), "--workers", "1", "--limit", "pixels=2048", "--limit", "samples=2",
+             "--limit", "job_seconds=20")  # fmt: skip
+    with running(tmp_path_factory.mktemp("schema") / "data", *words) as server:
+        yield server
+
+
+@pytest.fixture(scope="module")
+def jobs(server: Server) -> list[str]:
+    """A finished job of each kind, for what asks for a job."""
+    found = []
+    with server.client() as client:
+        for verb in WORK:
+            settings = {**SMALL, "aovs": ["Z"]} if verb == "render" else {}
+            sent = {"stage": "window.usda", **settings}
+            found.append(client.post(f"/v1/{verb}", json=sent).headers["content-location"].rpartition("/")[2])
+    return found
+
+
+@pytest.fixture
+def prepared(jobs: list[str]) -> Iterator[None]:
+    """Requests that are right name a stage, or a job, that is there; headers change from one to the next."""
+    count = iter(range(1_000_000))
+
+    def before_call(context: Any, case: Any, kwargs: Any) -> None:
+        number = next(count)
+        if not case.meta or case.meta.generation.mode.value != "positive":
+            return
+        case.headers = {**(case.headers or {}), **HEADERS[number % len(HEADERS)]}
+        if "identifier" in case.path_parameters and number % 4:
+            case.path_parameters["identifier"] = jobs[number % len(jobs)]
+            if "name" in case.path_parameters:
+                case.path_parameters["name"] = "Z"
+        if isinstance(case.body, dict) and "stage" in case.body:
+            if case.media_type == "multipart/form-data":
+                case.body["stage"] = BALL.encode()
+            elif number % 4:
+                case.body["stage"] = "window.usda"
+
+    schemathesis.hook(before_call)
+    yield
+    schemathesis.hooks.unregister(before_call)
+
+
+def explored(server: Server) -> Seen:
+    schema = schemathesis.openapi.from_url(f"{server.url}openapi.json", config=options.SchemathesisConfig())
+    schema.config.generation = options.GenerationConfig(
+        max_examples=EXAMPLES, deterministic=True, no_shrink=True, database="none"
+    )
+    schema.config.checks = options.ChecksConfig(**OFF)
+    schema.config.continue_on_failure = True
+    schema.config.request_timeout = 30
+    seen = Seen()
+    for event in from_schema(schema).execute():
+        if isinstance(event, events.NonFatalError | events.FatalError):
+            seen.failures.append(f"schemathesis itself: {getattr(event, 'info', event)}")
+        if isinstance(event, events.ScenarioFinished):
+            _note(event.recorder, seen)
+    return seen
+
+
+def _note(recorder: Any, seen: Seen) -> None:
+    for identifier, interaction in recorder.interactions.items():
+        label = recorder.cases[identifier].value.operation.label
+        if interaction.response is not None:
+            seen.answers[(label, interaction.response.status_code)] += 1
+        for check in recorder.checks.get(identifier, ()):
+            seen.checks[check.name] += 1
+            if check.failure_info:
+                request, response = interaction.request, interaction.response
+                answer = f"{response.status_code} {response.content[:300]!r}" if response else "no answer"
+                seen.failures.append(
+                    f"{check.name}: {check.failure_info.failure.message}\n    {request.method} {request.uri} "
+                    f"{(request.body or b'')[:300]!r}\n    -> {answer}"
+                )
+
+
+@pytest.mark.usefixtures("prepared")
+def test_every_answer_is_as_the_document_says(server: Server) -> None:
+    seen = explored(server)
+    assert not seen.failures, "\n".join(sorted(seen.failures)[:20])
+    checks = {"not_a_server_error", "status_code_conformance", "content_type_conformance", "negative_data_rejection",
+              "response_schema_conformance", "unsupported_method", "allow_header_conformance"}  # fmt: skip
+    assert checks <= seen.checks.keys()
+    assert not OFF.keys() & seen.checks.keys()
+    with server.client() as client:
+        paths = client.get("/openapi.json").json()["paths"]
+        operations = {f"{method.upper()} {path}" for path, methods in paths.items() for method in methods}
+    assert operations == {label for label, _ in seen.answers}
+    for verb in WORK:  # good requests were among them, and bad ones
+        statuses = {status for label, status in seen.answers if label == f"POST /v1/{verb}"}
+        assert {200, 202, 406, 422} <= statuses, (verb, statuses)
+    assert seen.answers[("GET /v1/jobs/{identifier}/image", 200)] > 0
+
+
+@pytest.mark.parametrize("verb", WORK)
+def test_well_formed_requests_for_a_stage_that_is_there_are_done(server: Server, verb: str) -> None:
+    settings = SMALL if verb == "render" else {}
+    with server.client() as client:
+        assert client.post(f"/v1/{verb}", json={"stage": "marble.usda", **settings}).status_code == 200
+        form = client.post(f"/v1/{verb}", files=upload(BALL), data={"settings": json.dumps(settings)})
+        assert form.status_code == 200

@@ -1,0 +1,280 @@
+"""The parts of the service one by one: limits, models, bodies, the check of a stage's files, the lock, the store."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+from pxr import UsdUtils
+from service_server import ROOT, InProcess
+from service_stages import HEAD, escapes, referring
+
+from refract_core.aovs import AOVS
+from refract_core.errors import UsageError
+from refract_core.settings import MODELS, PURPOSES, SCREEN_METHODS, TIERS, RenderSettings
+from service import confine, models, precheck, problems
+from service.app import Settings, create_app
+from service.bodies import check, parse
+from service.jobs import engine
+from service.limits import Limits, limits_from, table
+from service.problems import KINDS, Problem
+from service.store import Record, Store
+
+GOOD = ROOT / "usd_samples" / "good"
+
+
+# --- limits
+
+
+def test_the_environment_and_then_flags_set_limits() -> None:
+    environment = {"REFRACT_LIMIT_SAMPLES": "8", "REFRACT_LIMIT_PIXELS": "100", "HOME": "/"}
+    limits = limits_from({"samples": 4, "aovs": None}, environment)
+    assert (limits.samples, limits.pixels, limits.aovs) == (4, 100, Limits().aovs)
+    assert {row["name"]: row["value"] for row in table(limits)}["samples"] == 4
+
+
+@pytest.mark.parametrize("environment", [{"REFRACT_LIMIT_NOPE": "1"}, {"REFRACT_LIMIT_SAMPLES": "x"},
+                                         {"REFRACT_LIMIT_SAMPLES": "0"}])  # fmt: skip
+def test_a_wrong_limit_is_a_wrong_usage(environment: dict[str, str]) -> None:
+    with pytest.raises(UsageError):
+        limits_from({}, environment)
+
+
+# --- models: the same words as the engine
+
+
+def test_the_models_have_the_engines_words() -> None:
+    assert get_args(models.Model) == MODELS
+    assert get_args(models.Tier) == TIERS
+    assert get_args(models.Purpose) == PURPOSES
+    assert get_args(models.Aov) == tuple(AOVS)
+    known = {one.name for one in fields(RenderSettings)} - {"jobs", "tile_size"}
+    assert known <= models.Render.model_fields.keys()
+    assert set(SCREEN_METHODS) == {"march", "proxy"}
+
+
+@pytest.mark.parametrize(
+    ("settings", "pointer"),
+    [
+        ({"samples": True}, "/samples"), ({"samples": 1.0}, "/samples"), ({"samples": "4"}, "/samples"),
+        ({"exposure": False}, "/exposure"), ({"exposure": float("inf")}, "/exposure"), ({"sample": 1}, "/sample"),
+        ({"tiers": ["screen", "moon"]}, "/tiers/1"), ({"tiers": []}, "/tiers"), ({"camera": 7}, "/camera"),
+        ({"camera": "a\0b"}, "/camera"), ({"overrides": {"/a/b": {"ior": 0.5}}}, "/overrides/~1a~1b/ior"),
+        ({"overrides": {"/a": {"colour": 1}}}, "/overrides/~1a/colour"), ({"image_width": 0}, "/image_width"),
+        ({"overrides": {"/a": {"transmittanceColor": [1, 1]}}}, "/overrides/~1a/transmittanceColor"),
+        ({"time_code": True}, "/time_code"), ([], ""), (None, ""), ("x", ""),
+    ],
+)  # fmt: skip
+def test_models_are_strict_and_point_at_the_field(settings: Any, pointer: str) -> None:
+    with pytest.raises(Problem) as caught:
+        check(models.Render, settings)
+    assert [one["pointer"] for one in caught.value.errors] == [pointer]
+
+
+def test_a_whole_number_is_a_number() -> None:
+    assert check(models.Render, {"exposure": 1, "samples": 4}).model_dump(exclude_none=True) == {
+        "exposure": 1.0, "samples": 4
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("text", ["", "{", '{"a": NaN}', "[Infinity]", "-Infinity", "[" * 100_000, "1" * 5000, b"\xff"])
+def test_what_is_not_json_is_a_problem(text: str | bytes) -> None:
+    with pytest.raises(Problem) as caught:
+        parse(text)
+    assert caught.value.slug == "bad-request"
+
+
+# --- the check of a stage's files
+
+
+@pytest.mark.parametrize("name", list(escapes("/x/y.usda")))
+def test_every_way_out_is_refused_before_usd_composes(tmp_path: Path, name: str) -> None:
+    (tmp_path / "a.usda").write_text(escapes("/x/y.usda")[name])
+    with pytest.raises(precheck.Refused):
+        precheck.check_stage(str(tmp_path / "a.usda"), str(tmp_path), layers=10, unpacked_bytes=1000)
+
+
+def test_a_link_that_leads_out_is_refused_and_one_inside_is_not(tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    root.mkdir()
+    (tmp_path / "out.usda").write_text(HEAD)
+    (root / "in.usda").write_text(HEAD)
+    (root / "a.usda").write_text(referring("./link.usda"))
+    (root / "link.usda").symlink_to("in.usda")
+    precheck.check_stage(str(root / "a.usda"), str(root), layers=10, unpacked_bytes=1000)
+    (root / "link.usda").unlink()
+    (root / "link.usda").symlink_to(tmp_path / "out.usda")
+    with pytest.raises(precheck.Refused):
+        precheck.check_stage(str(root / "a.usda"), str(root), layers=10, unpacked_bytes=1000)
+
+
+def test_too_many_layers_are_refused(tmp_path: Path) -> None:
+    for index in range(5):
+        (tmp_path / f"{index}.usda").write_text(referring(f"./{index + 1}.usda"))
+    root = str(tmp_path)
+    precheck.check_stage(str(tmp_path / "0.usda"), root, layers=6, unpacked_bytes=1000)
+    with pytest.raises(precheck.TooMany):
+        precheck.check_stage(str(tmp_path / "0.usda"), root, layers=3, unpacked_bytes=1000)
+
+
+def test_samples_and_their_packages_pass(tmp_path: Path) -> None:
+    for path in sorted(GOOD.glob("*.usda")):
+        precheck.check_stage(str(path), str(GOOD), layers=50, unpacked_bytes=1000)
+    UsdUtils.CreateNewUsdzPackage(str(GOOD / "marble.usda"), str(tmp_path / "m.usdz"))
+    precheck.check_stage(str(tmp_path / "m.usdz"), str(tmp_path), layers=50, unpacked_bytes=10_000_000)
+    with pytest.raises(precheck.TooMany):
+        precheck.check_stage(str(tmp_path / "m.usdz"), str(tmp_path), layers=50, unpacked_bytes=1000)
+
+
+# --- the lock
+
+
+@pytest.mark.skipif(not confine.landlock_abi() or not confine.available()["seccomp"], reason="this kernel has no lock")
+def test_a_confined_process_reaches_nothing_but_its_folder(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "secret").write_text("x")
+    code = f"""
+import ctypes, os, socket, sys, threading, resource
+sys.path.insert(0, {str(ROOT)!r})
+from service.confine import Means, confine
+confine([sys.prefix, sys.base_prefix, "/usr/lib", "/lib"], [{str(tmp_path / "mine")!r}], Means(1 << 30, 5, 1000, 64))
+def tried(what):
+    try: what(); return "done"
+    except (OSError, MemoryError, ValueError) as error: return type(error).__name__
+def big():
+    with open({str(tmp_path / "mine" / "big")!r}, "wb") as file: file.write(b"x" * 2000); file.flush()
+def thread():
+    one = threading.Thread(target=lambda: None); one.start(); one.join()
+print(tried(lambda: open({str(tmp_path / "mine" / "a")!r}, "w").close()), tried(thread),
+      tried(lambda: open({str(tmp_path / "other" / "secret")!r})), tried(lambda: os.listdir("/etc")),
+      tried(lambda: open({str(tmp_path / "other" / "new")!r}, "w")), tried(socket.socket), tried(os.fork),
+      tried(lambda: os.execv("/bin/true", ["true"])), tried(lambda: os.kill(os.getppid(), 0)), tried(big),
+      tried(lambda: bytearray(2 << 30)), tried(lambda: resource.setrlimit(resource.RLIMIT_AS, (-1, -1)) or 0))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    words = done.stdout.split()
+    assert words[:2] == ["done", "done"], done.stderr
+    assert words[2:9] == ["PermissionError"] * 7
+    assert words[9:] == ["OSError", "MemoryError", "ValueError"]  # the last tries to raise its own limit again
+    assert (tmp_path / "mine" / "a").exists()
+
+
+# --- the store
+
+
+def test_a_record_survives_and_an_orphan_has_failed(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    done = Record("a" * 64, "render", {"format": "png"}, "x.usda", False, status="done")
+    left = Record("b" * 64, "inspect", {}, "stage.usda", True, status="running")
+    for record in (done, left):
+        store.save(record)
+    (store.folder(left.id) / "stage.usda").write_text("theirs")
+    (store.jobs / "rubbish").mkdir()
+    found = Store(tmp_path).load_all()
+    assert found[done.id] == done
+    assert found[left.id].problem is not None
+    assert found[left.id].status == "failed"
+    assert not (store.folder(left.id) / "stage.usda").exists()
+    assert not (store.jobs / "rubbish").exists()
+
+
+def test_only_plain_files_of_known_names_are_taken(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    record = Record("a" * 64, "render", {}, "x.usda", False)
+    store.save(record)
+    work = store.new_work()
+    (work / "out" / "image.png").symlink_to("/etc/passwd")
+    (work / "out" / "record.json").write_text("{}")
+    (work / "out" / "aov.Z.png").write_text("picture")
+    store.take_results(work, record)
+    assert sorted(path.name for path in store.folder(record.id).iterdir()) == ["aov.Z.png", "record.json"]
+    assert json.loads((store.folder(record.id) / "record.json").read_text())["id"] == record.id
+
+
+# --- the app without workers
+
+
+@pytest.fixture
+def client(tmp_path: Path) -> InProcess:
+    app = create_app(Settings(stage_root=str(GOOD), data=str(tmp_path / "data")))
+
+    @app.get("/broken")
+    async def broken() -> None:
+        raise RuntimeError("secret /path")
+
+    return InProcess(app)
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status"),
+    [("GET", "/nothing", 404), ("PUT", "/v1/render", 405), ("GET", "/v1/render", 405), ("GET", "/v1/jobs/x", 404),
+     ("GET", "/v1/jobs/x/aovs/..%2F..%2Frecord.png", 404), ("POST", "/v1/render", 415), ("GET", "/broken", 500),
+     ("GET", "/readyz", 503), ("GET", "/static/../app.py", 404), ("GET", "/problems/none", 404)],
+)  # fmt: skip
+def test_every_error_is_a_problem_document(client: InProcess, method: str, path: str, status: int) -> None:
+    answer = client.request(method, path)
+    assert answer.status_code == status
+    assert answer.headers["content-type"] == "application/problem+json"
+    document = answer.json()
+    assert document["status"] == status
+    assert document["type"].removeprefix("/problems/") in KINDS
+    assert "secret" not in answer.text
+    assert client.get(document["type"]).status_code == 200
+
+
+@pytest.mark.parametrize("body", [b"{", b"[]", b'{"samples": NaN, "stage": "marble.usda"}', b'"x"'])
+def test_no_body_makes_the_service_fail(client: InProcess, body: bytes) -> None:
+    answer = client.post("/v1/render", content=body, headers={"Content-Type": "application/json"})
+    assert answer.status_code in (400, 422)
+    assert "NaN" not in answer.text
+
+
+@pytest.mark.parametrize("parts", [{}, {"stage": ("a", b"no usd")}, {"other": ("a", b"#usda 1.0")}])
+def test_a_wrong_form_is_a_problem(client: InProcess, parts: dict[str, Any]) -> None:
+    answer = client.post("/v1/render", files=parts, data={"settings": "{}"})
+    assert answer.status_code in (415, 422)
+    assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_another_sites_page_may_not_ask_for_work(client: InProcess) -> None:
+    body = {"stage": "marble.usda", "samples": 100_000}
+    theirs = client.post("/v1/render", json=body, headers={"Origin": "https://example.com"})
+    assert theirs.json()["type"] == "/problems/cross-origin"
+    assert client.post("/v1/render", json=body, headers={"Origin": "http://testserver"}).status_code == 422
+
+
+def test_pages_load_nothing_from_elsewhere(client: InProcess) -> None:
+    for path in ("/docs", "/problems/too-large", "/"):
+        answer = client.get(path)
+        assert answer.status_code == 200
+        assert 'src="http' not in answer.text
+        assert 'rel="stylesheet" href="http' not in answer.text
+
+
+def test_the_openapi_document_names_every_route(client: InProcess) -> None:
+    paths = client.get("/openapi.json").json()["paths"]
+    for path in ("/v1/render", "/v1/convert", "/v1/inspect", "/v1/validate", "/v1/jobs/{identifier}", "/v1/stages",
+                 "/v1/limits", "/livez", "/readyz", "/metrics"):  # fmt: skip
+        assert path in paths
+    form = paths["/v1/render"]["post"]["requestBody"]["content"]
+    assert form["application/json"]["schema"]["additionalProperties"] is False
+    assert "samples" in form["application/json"]["schema"]["properties"]
+
+
+def test_settings_are_checked() -> None:
+    for wrong in ({"workers": 0}, {"queue": -1}, {"stage_root": "/nowhere/at/all"}, {"tokens": ("short",)}):
+        with pytest.raises(UsageError):
+            Settings(**wrong)
+
+
+def test_the_engine_has_one_name() -> None:
+    assert engine() == engine()
+    assert {kind.status for kind in problems.KINDS.values()} >= {400, 401, 404, 405, 413, 415, 422, 429, 500, 503}
+    assert socket.AF_UNIX  # workers are spoken to through such sockets
