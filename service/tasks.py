@@ -23,6 +23,8 @@ from .problems import Problem
 Say = Callable[..., None]
 """Tells the server something: `say(progress=0.5, stage="image")`, `say(path=..., warning=...)`."""
 
+_QUOTES = r"\(recompos[^)]*\)| -- .*|\b(?:syntax|parse) error.*|\(line .*|\S*pxrInternal.*"
+"""Where USD's messages begin to quote files, or its own source."""
 _THIN = 0.005  # [m] thickness and absorption distance of the thin model
 _UNITS = ("Z", "thickness", "path_length", "layers")
 """Planes that are not between 0 and 1: their PNG is scaled, and says by how much."""
@@ -64,7 +66,7 @@ def _public(text: str) -> str:
     text = text.split(" cannot be read as ")[0] + " cannot be read as USD" if " cannot be read as " in text else text
     if text.startswith("USD says:"):
         return "USD warned about this stage; `refract render` on it shows what it said"
-    text = re.sub(r"\(recompos[^)]*\)| -- .*|\b(?:syntax|parse) error.*|\(line .*|\S*pxrInternal\S*.*", "", text).strip()
+    text = re.sub(_QUOTES, "", text).strip()
     for folder in sorted({os.getcwd(), os.path.realpath("."), os.path.dirname(os.getcwd())}, key=len, reverse=True):
         text = text.replace(folder + os.sep, "")
     for known in (os.path.expanduser("~"), os.path.dirname(os.path.dirname(__file__))):

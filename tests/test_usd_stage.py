@@ -351,3 +351,11 @@ def test_every_real_stage_reads_or_is_refused_in_words(assets: Path) -> None:
             if mesh.normals is not None:
                 assert np.linalg.norm(mesh.normals, axis=2) == pytest.approx(1.0, abs=1e-5), path
     assert seen > 100
+
+
+def test_words_that_are_no_text_are_a_sentence_too(tmp_path: Path) -> None:
+    """USD quotes the line it could not read, and here that line is not UTF-8."""
+    file = tmp_path / "broken.usda"
+    file.write_bytes(b'#usda 1.0\ndef Xform "\xff\xfe\xfa" { \xff }\n')
+    with pytest.raises(StageError, match="cannot be read"):
+        open_stage(file)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdUtils
 
 from ..scene import Notice
+from .layers import words_of
 from .materials import API
 from .stage import open_stage, stage_unit, time_range
 from .write import RECORD, overlay
@@ -69,7 +70,7 @@ def _flat(stage: Usd.Stage) -> tuple[Sdf.Layer, list[str]]:
     """One layer with everything, and what USD says about that."""
     delegate = UsdUtils.CoalescingDiagnosticDelegate()
     layer = stage.Flatten()
-    said = [" ".join(str(one.commentary).split()) for one in delegate.TakeUncoalescedDiagnostics()]
+    said = [words_of(one) for one in delegate.TakeUncoalescedDiagnostics()]
     return layer, list(dict.fromkeys(said))
 
 

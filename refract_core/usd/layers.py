@@ -4,10 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from pxr import Ar, Sdf, Tf, UsdUtils
 
 from ..errors import StageError
+
+
+def words_of(diagnostic: Any) -> str:
+    """What USD says, in one line. It quotes files, and those may hold bytes that are no text."""
+    try:
+        return " ".join(str(diagnostic.commentary).split())
+    except UnicodeDecodeError:
+        return "USD's own words quote bytes of the file that are not text"
 
 
 @contextmanager
@@ -63,7 +72,7 @@ def export(layer: Sdf.Layer, path: str, out: str) -> None:
         try:
             written = layer.Export(path)
         except Tf.ErrorException as error:
-            reason = " ".join(str(error.args[0].commentary).split())
+            reason = words_of(error.args[0])
             raise StageError(f"{out}: cannot be written: {reason}") from error
     if not written:
         raise StageError(f"{out}: cannot be written; is there space, and may the folder be written?")

@@ -19,6 +19,7 @@ from ..errors import StageError, UsageError
 from ..scene import F64, Mesh, Notice, Scene, Sphere
 from .camera import choose_camera, read_cameras
 from .geometry import Shape, read_shape
+from .layers import words_of
 from .lights import read_lights
 from .parts import Bound, Part, Tables, assemble, bind
 from .place import Placed, bounds_of, place, to_mesh, to_sphere
@@ -55,10 +56,10 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
         try:
             stage = Usd.Stage.Open(name)
         except Tf.ErrorException as error:
-            heard.extend(str(part.commentary) for part in error.args)
+            heard.extend(words_of(part) for part in error.args)
             stage = None
     if stage is None:
-        reason = " ".join(heard[0].split()) if heard else "USD gives no reason"
+        reason = heard[0] if heard else "USD gives no reason"
         raise StageError(f"{name}: cannot be read as .usd, .usda, .usdc or .usdz: {reason}")
     with captured():
         for layer in stage.GetUsedLayers():  # USD keeps layers in memory; a changed file would show its old content
@@ -116,7 +117,7 @@ def scene_from_stage(
         try:
             scene = _read(stage, time, purposes, camera, notices, keep)
         except Tf.ErrorException as error:
-            reason = " ".join(str(error.args[0].commentary).split())
+            reason = words_of(error.args[0])
             raise StageError(f"{stage.GetRootLayer().identifier}: USD cannot read it: {reason}") from error
     warnings = dict.fromkeys(" ".join(text.split()) for text in heard)
     notices.extend(Notice(scene.name, f"USD says: {text}") for text in list(warnings)[:_WARNINGS])
@@ -131,7 +132,7 @@ def captured() -> Iterator[list[str]]:
     try:
         yield heard
     finally:
-        heard.extend(str(diagnostic.commentary) for diagnostic in delegate.TakeUncoalescedDiagnostics())
+        heard.extend(words_of(diagnostic) for diagnostic in delegate.TakeUncoalescedDiagnostics())
 
 
 def _composition_notices(stage: Usd.Stage) -> list[Notice]:
@@ -271,6 +272,6 @@ def _part(prim: Usd.Prim, bound: Bound, shapes: dict[Sdf.Path, Shape | None], ta
             shapes[key] = shape
         return assemble(prim, shape, bound, tables) if shape is not None else None
     except Tf.ErrorException as error:
-        reason = " ".join(str(part.commentary) for part in error.args)
+        reason = " ".join(words_of(part) for part in error.args)
         tables.notices.append(Notice(str(prim.GetPath()), f"skipped: USD cannot read it: {reason}"))
         return None
