@@ -15,6 +15,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse
 from fastapi.staticfiles import StaticFiles
 from starlette.exceptions import HTTPException as StarletteHTTPException
+from starlette.routing import Match
 
 from refract_core.errors import UsageError
 from refract_core.version import __version__
@@ -106,7 +107,10 @@ def _add_handlers(app: FastAPI) -> None:
     async def on_http(request: Request, error: Exception) -> Response:
         assert isinstance(error, StarletteHTTPException)
         slug = BY_STATUS.get(error.status_code, "bad-request" if error.status_code < 500 else "internal")
-        return respond(Problem(slug, KINDS[slug].title, headers=dict(error.headers or {})))
+        headers = dict(error.headers or {})
+        if error.status_code == 405:
+            headers["Allow"] = ", ".join(_methods_here(request))
+        return respond(Problem(slug, KINDS[slug].title, headers=headers))
 
     async def on_validation(request: Request, error: Exception) -> Response:
         return respond(Problem("invalid-settings", "a parameter of the path or query is not valid"))
@@ -121,6 +125,12 @@ def _add_handlers(app: FastAPI) -> None:
     app.add_exception_handler(HTTPException, on_http)
     app.add_exception_handler(RequestValidationError, on_validation)
     app.add_exception_handler(Exception, on_anything)
+
+
+def _methods_here(request: Request) -> list[str]:
+    """Methods of a path. Starlette names those of the first route that fits, and a path may have several."""
+    fitting = [route for route in request.app.routes if route.matches(request.scope)[0] is not Match.NONE]
+    return sorted({method for route in fitting for method in getattr(route, "methods", None) or ()})
 
 
 def _add_pages(app: FastAPI, settings: Settings, metrics: Metrics) -> None:

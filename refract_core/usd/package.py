@@ -6,6 +6,7 @@ packed here in the tree in which they lie on disk: relative paths, and expressio
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import struct
@@ -199,8 +200,10 @@ def _extract(package: str, folder: Path) -> str:
             if not entries:
                 raise StageError(f"{package}: is an empty package; make it again")
             archive.extractall(folder, entries)
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
-        raise StageError(f"{package}: is a damaged package: {error}") from error
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError, OSError) as error:
+        if isinstance(error, OSError) and error.errno != errno.EINVAL:  # a full disk, not an offset before the file
+            raise
+        raise StageError(f"{package}: is a damaged package; make it again") from error
     return entries[0].filename
 
 

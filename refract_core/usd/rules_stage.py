@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from functools import lru_cache
 
-from pxr import Usd, UsdGeom
+from pxr import Tf, Usd, UsdGeom
 
 from ..errors import StageError
 from ..scene import Notice, Scene
+from .layers import words_of
 from .rules import (
     ERROR,
     FALLBACK,
@@ -111,7 +112,11 @@ def stock_findings(stage: Usd.Stage) -> list[Finding]:
     kinds = UsdValidation.ValidationErrorType
     severities = {kinds.Error: ERROR, kinds.Warn: WARNING}
     with captured():  # what they warn of, they also return
-        errors = context.Validate(stage)
+        try:
+            errors = context.Validate(stage)
+        except Tf.ErrorException as error:  # damaged values, which none of them expects
+            said = " ".join(words_of(part) for part in error.args)
+            return [Finding(UNREADABLE.id, ERROR, "/", f"USD's own validators gave up: {said}", "")]
     return [
         Finding(
             str(error.GetIdentifier()),
