@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
-
-from pxr import Ar
 
 from ..errors import ImageError
 from ..scene import Bake, Cubemap
 from .probe_values import ProbePrim
-from .textures import resolve_asset
+from .textures import file_of, resolve_asset
 
 BAKE_KEY = "refractBake"
 """Dictionary in a probe's customData: digest, engine and timeCode are read; stage and samples are for people."""
@@ -32,16 +29,7 @@ def read_cubemap(path: str, resolution: int) -> Cubemap:
     """
     from ..image import read_cubemap as decode
 
-    if not Ar.IsPackageRelativePath(path):
-        if not Path(path).is_file():
-            raise ImageError(f"{path}: no such file; check the path, which is relative to the layer that names it")
-        return decode(path, path, resolution)
-    asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(path))
-    if not asset:
-        package, inner = Ar.SplitPackageRelativePathOuter(path)
-        name = Path(package).name
-        raise ImageError(f"{path}: {name} holds no file '{inner}'; look into it with `usdzip -l {name}`")
-    return decode(bytes(asset.GetBuffer()), path, resolution)
+    return decode(file_of(path), path, resolution)
 
 
 def picture_of(probe: ProbePrim, mode: str, resolution: int, read: ReadCubemap) -> tuple[Cubemap | None, Bake | None]:

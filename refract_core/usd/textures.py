@@ -54,16 +54,25 @@ def read_texture(path: str, color_space: str) -> Texture:
     if _UDIM in path:
         raise ImageError(f"{path}: UDIM tiles are not read; name a single image file")
     name = texture_key(path, color_space)
+    return decode(file_of(path), name=name, color_space=color_space)
+
+
+def file_of(path: str) -> str | bytes:
+    """What a picture is decoded from: the path of a file, or the bytes of one inside a package.
+
+    Raises:
+        ImageError: there is no such file.
+    """
     if not Ar.IsPackageRelativePath(path):
         if not Path(path).is_file():
             raise ImageError(f"{path}: no such file; check the path, which is relative to the layer that names it")
-        return decode(path, name=name, color_space=color_space)
+        return path
     asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(path))
     if not asset:
         package, inner = Ar.SplitPackageRelativePathOuter(path)
         name = Path(package).name
         raise ImageError(f"{path}: {name} holds no file '{inner}'; look into it with `usdzip -l {name}`")
-    return decode(bytes(asset.GetBuffer()), name=name, color_space=color_space)
+    return bytes(asset.GetBuffer())
 
 
 def numbers(value: Any) -> tuple[float, ...] | None:
