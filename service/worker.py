@@ -28,6 +28,7 @@ from . import confine
 _QUIET = {"PXR_WORK_THREAD_LIMIT": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENIMAGEIO_THREADS": "1",
           "PXR_AR_DISABLE_PLUGIN_RESOLVER": "1", "PXR_AR_DISABLE_PLUGIN_URI_RESOLVERS": "1",
           "TF_ENV_SETTING_ALERTS_ENABLED": "0"}  # fmt: skip
+_HURRY = 0.01  # [s] a job that waited in the queue comes at once
 _UNSET = ("PXR_PLUGINPATH_NAME", "PXR_AR_DEFAULT_SEARCH_PATH", "OCIO", "PYTHONSTARTUP")
 
 
@@ -133,6 +134,10 @@ def _child(descriptor: int, parent: int) -> None:
 
 
 def _serve(descriptor: int) -> int:
+    if not select.select([descriptor], [], [], _HURRY)[0]:  # nobody waits for this worker yet
+        from . import warm
+
+        warm.draw(("march",))
     with os.fdopen(descriptor, "rb", closefd=False) as file:
         line = file.readline()
     if not line:
