@@ -20,6 +20,7 @@ from .version import __version__
 if TYPE_CHECKING:
     from .errors import Cancelled, EmbreeError, ImageError, RefractError, SceneError, StageError, UsageError
     from .frame import Frame
+    from .override import OverrideError, override
     from .render import render
     from .scene import Notice, Scene
     from .settings import RenderSettings
@@ -31,6 +32,7 @@ __all__ = [
     "Frame",
     "ImageError",
     "Notice",
+    "OverrideError",
     "RefractError",
     "RenderSettings",
     "Scene",
@@ -39,6 +41,7 @@ __all__ = [
     "UsageError",
     "__version__",
     "load_stage",
+    "override",
     "render",
 ]
 
@@ -48,6 +51,7 @@ _ROOMS = {
     "Frame": "frame",
     "ImageError": "errors",
     "Notice": "scene",
+    "OverrideError": "override",
     "RefractError": "errors",
     "RenderSettings": "settings",
     "Scene": "scene",
@@ -55,6 +59,7 @@ _ROOMS = {
     "StageError": "errors",
     "UsageError": "errors",
     "load_stage": "usd.stage",
+    "override": "override",
     "render": "render",
 }
 
@@ -73,7 +78,7 @@ def __dir__() -> list[str]:
 
 
 class _Package(ModuleType):
-    """A package where `render` stays the function, although a module of that name is imported too."""
+    """A package where `render` and `override` stay functions, although modules of those names are imported too."""
 
     def __setattr__(self, name: str, value: object) -> None:
         if name in _ROOMS and isinstance(value, ModuleType):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from .errors import Cancelled, ImageError, UsageError
 from .executors import Bench, Crew, file_bytes, patience, sent_stage, spread
 from .files import replacing
+from .override import OverrideError, Overrides, check_overrides, override, override_notes
 from .progress import Report
 from .scene import Notice, Scene
 from .settings import RenderSettings
@@ -35,6 +37,8 @@ class Order:
     """USD frame specs with commas between; '' is the stage's start."""
     overrides: Mapping[str, object] = field(default_factory=dict)
     """Fields of `RenderSettings` that win over what the stage authors."""
+    materials: Overrides = field(default_factory=dict)
+    """Values that win over what single materials author, see `refract_core.override`."""
     settings_prim: str = ""
     """RenderSettings prim whose authored values win over the defaults; '' is the one the stage names, if any."""
     aovs: tuple[str, ...] = ()
@@ -61,6 +65,8 @@ def render_files(order: Order, report: Report, cancel: Callable[[], bool], crew:
     _settings({}, order.overrides)
     if order.complexity not in COMPLEXITIES:
         raise UsageError(f"--complexity is '{order.complexity}', not known; choose from {', '.join(COMPLEXITIES)}")
+    with _flag():
+        check_overrides(order.materials)
     check_output(order.out, order.aovs, order.color_correction)
     check_writable(order.out)
     jobs = frame_jobs(order.frames, order.out)
@@ -78,10 +84,11 @@ class _Shot(NamedTuple):
     time_code: float | None
     path: str
     settings: RenderSettings
+    materials: Overrides
     aovs: tuple[str, ...]
     color_correction: str
     first: bool
-    """Looks for stale probes as well."""
+    """Looks for stale probes as well, and for overrides that name nothing."""
 
 
 class _Picture(NamedTuple):
@@ -116,7 +123,7 @@ def _render_jobs(
         found.append(Notice("--complexity", "subdivision is not done yet, so every complexity draws the same"))
     settings = _settings(read_settings(stage, order.settings_prim, found), order.overrides)
     tell(found)
-    choices = settings, order.aovs, order.color_correction
+    choices = settings, order.materials, order.aovs, order.color_correction
     shots = [_Shot(job.time_code, job.path, *choices, job is jobs[0]) for job in jobs]
     if crew is None:
         _render_here(stage, shots, tell, report, cancel)
@@ -155,14 +162,25 @@ def _draw(
 
     _stop_if(cancel)
     settings = shot.settings
-    scene = read(time_code=shot.time_code, purposes=settings.purposes, camera=settings.camera)
+
+    def changed(*, strict: bool = False, **how: Any) -> Scene:
+        """What is read, with the order's values in it. At other times than the first a named thing may be hidden."""
+        with _flag():
+            return override(read(**how), shot.materials, strict=strict)
+
+    scene = changed(strict=shot.first, **_how(shot))
     tell(scene.notices)
     if shot.first:
-        tell(_stale(read, scene, settings))
+        tell(_stale(changed, scene, settings))
     _stop_if(cancel)
     frame = render(scene, settings, progress=progress, cancel=cancel)
     tell(frame.notices)
-    return frame
+    return replace(frame, metadata={**frame.metadata, **override_notes(shot.materials)})
+
+
+def _how(shot: _Shot) -> dict[str, Any]:
+    """What of a stage to read for a shot."""
+    return {"time_code": shot.time_code, "purposes": shot.settings.purposes, "camera": shot.settings.camera}
 
 
 def _render_elsewhere(
@@ -175,6 +193,11 @@ def _render_elsewhere(
     crew: Crew,
 ) -> None:
     """Frames as pieces of work for a crew; what comes back is written here, so that each is written once and whole."""
+    from .usd.stage import scene_from_stage
+
+    if order.materials:  # before anybody draws a frame: the first one alone would notice
+        with _flag():
+            override(scene_from_stage(stage, **_how(shots[0])), order.materials)
     root = stage.GetRootLayer()
     sent = sent_stage(order.stage, root.realPath or root.identifier)
     report.progress(0.0, "waiting for the first frame")
@@ -231,6 +254,15 @@ def _part(report: Report, done: int, count: int) -> Callable[[float, str], None]
     """Progress of one frame as progress of all."""
     prefix = f"frame {done + 1} of {count}: " if count > 1 else ""
     return lambda fraction, stage: report.progress((done + fraction) / count, prefix + stage)
+
+
+@contextmanager
+def _flag() -> Iterator[None]:
+    """What is wrong with an override, said with its flag."""
+    try:
+        yield
+    except OverrideError as error:
+        raise UsageError(f"--override {error}") from error
 
 
 def _stop_if(cancel: Callable[[], bool]) -> None:

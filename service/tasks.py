@@ -16,7 +16,8 @@ import numpy as np
 
 from refract_core.aovs import AOVS
 from refract_core.errors import EmbreeError, ImageError, RefractError, SceneError, StageError, UsageError
-from refract_core.scene import Model, Notice, Param, Scene, Source
+from refract_core.override import OverrideError, Overrides, override, override_notes
+from refract_core.scene import Notice, Scene
 
 from .problems import Problem
 
@@ -25,7 +26,6 @@ Say = Callable[..., None]
 
 _QUOTES = r"\(recompos[^)]*\)| -- .*|\b(?:syntax|parse) error.*|\(line .*|\S*pxrInternal.*"
 """Where USD's messages begin to quote files, or its own source."""
-_THIN = 0.005  # [m] thickness and absorption distance of the thin model
 _UNITS = ("Z", "thickness", "path_length", "layers")
 """Planes that are not between 0 and 1: their PNG is scaled, and says by how much."""
 _SETTINGS = ("camera", "image_width", "image_height", "samples", "tiers", "screen", "model", "max_layers", "exposure",
@@ -105,14 +105,16 @@ def _render(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[s
     _check_scene(scene, limits)
     width, height = image_size(choose_camera(scene, wanted.camera), wanted.image_width, wanted.image_height)
     _check_size(width, height, wanted.samples, limits)
-    scene = override(scene, settings.get("overrides") or {})
+    overrides = settings.get("overrides") or {}
+    scene = _override(scene, overrides)
     told = [*found, *scene.notices]
     frame = render(scene, wanted, progress=lambda share, work: say(progress=share, stage=work))
     _tell([*told, *frame.notices], say, limits)
     correction = settings.get("color_correction") or "sRGB"
     aovs = settings.get("aovs") or []
     extension = settings["format"]
-    frame = replace(frame, metadata={**frame.metadata, "refract:stage": os.path.basename(stage)})
+    notes = {**override_notes(overrides), "refract:stage": os.path.basename(stage)}
+    frame = replace(frame, metadata={**frame.metadata, **notes})
     frame.save(os.path.join(out, f"image.{extension}"), aovs=aovs if extension == "exr" else (),
                color_correction=correction)  # fmt: skip
     kept = []
@@ -146,60 +148,19 @@ def _check_size(width: int, height: int, samples: int, limits: Mapping[str, int]
             raise Problem("limit-exceeded", f"{what}: {name} would be {value}; the limit is {limits[name]}")
 
 
-def override(scene: Scene, overrides: Mapping[str, Mapping[str, Any]]) -> Scene:
-    """The scene with other values in some materials.
-
-    Args:
-        overrides: path of a material, or of a mesh or sphere bound to it -> fields to replace. Lengths in scene units.
-
-    Raises:
-        Problem: a path names no refractive material.
-    """
-    materials = list(scene.materials)
-    for path, changes in overrides.items():
-        bound = {int(index) for mesh in scene.meshes if mesh.path == path for index in mesh.materials}
-        bound |= {sphere.material for sphere in scene.spheres if sphere.path == path}
-        chosen = bound or {index for index, material in enumerate(materials) if material.name == path}
-        if not chosen:
-            raise Problem("invalid-settings", "an override names nothing that is drawn; see /v1/inspect", prim=path,
-                          errors=[{"pointer": f"/overrides/{pointer(path)}", "detail": "no material and no shape"}])
-        names = {materials[index].name for index in chosen}
-        for index, material in enumerate(materials):
-            if index in chosen or material.name in names:
-                materials[index] = _overridden(material, changes, scene.metres_per_unit)
-    return replace(scene, materials=tuple(materials))
+def _override(scene: Scene, overrides: Overrides) -> Scene:
+    try:
+        return override(scene, overrides)
+    except OverrideError as error:
+        at = "".join(f"/{pointer(step)}" for step in ("overrides", error.path, error.field) if step)
+        about = "asks for a value that cannot be" if error.field else "names nothing that is drawn; see /v1/inspect"
+        raise Problem("invalid-settings", f"an override {about}", prim=error.path,
+                      errors=[{"pointer": at, "detail": _public(str(error))}]) from None  # fmt: skip
 
 
 def pointer(text: str) -> str:
     """One step of a JSON pointer (RFC 6901)."""
     return text.replace("~", "~0").replace("/", "~1")
-
-
-def _overridden(material: Any, changes: Mapping[str, Any], unit: float) -> Any:
-    inputs = list(material.inputs)
-
-    def put(param: Param, *value: float) -> None:
-        x, y, z = value if len(value) == 3 else value * 3
-        inputs[param] = Source(value=(x, y, z, 1.0 if len(value) == 3 else x))
-
-    if changes.get("ior") is not None:
-        put(Param.IOR, changes["ior"])
-    if changes.get("roughness") is not None:
-        put(Param.ROUGHNESS, changes["roughness"])
-    if changes.get("transmittanceColor") is not None:
-        put(Param.TRANSMITTANCE, *changes["transmittanceColor"])
-    if changes.get("thickness") is not None:
-        put(Param.THICKNESS, changes["thickness"] * unit)
-    distance = material.absorption_distance
-    if changes.get("absorptionDistance") is not None:
-        distance = changes["absorptionDistance"] * unit
-    model = Model[changes["model"].upper()] if changes.get("model") else material.model
-    if changes.get("model") and not material.refractive and model is not Model.NONE:
-        put(Param.OPACITY, 0.0)  # it had no opacity of glass to begin with
-    if model is Model.THIN:
-        put(Param.THICKNESS, _THIN)
-        distance = _THIN
-    return replace(material, inputs=tuple(inputs), model=model, absorption_distance=distance)
 
 
 # --- the other verbs ------------------------------------------------------------------------------------------------
@@ -223,12 +184,6 @@ def _validate(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping
 
 def _convert(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[str, int], say: Say) -> Any:
     from refract_core.convert import ConvertOrder, convert
-    from refract_core.usd import write
-
-    from .precheck import without_places
-
-    save = write.save
-    write.save = lambda layer, out: save(without_places(layer), out)  # this process makes one file, for a stranger
 
     order = ConvertOrder(
         stage=stage, out=os.path.join(out, "converted.usdz"), flatten=bool(settings.get("flatten")),

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import subprocess
+import sys
 from html.parser import HTMLParser
 from itertools import pairwise
 from pathlib import Path
@@ -19,7 +21,8 @@ from refract_core.settings import MODELS, SCREEN_METHODS, TIERS, RenderSettings
 
 STATIC = Path(__file__).parents[1] / "service" / "static"
 MARKUP = (STATIC / "index.html").read_text("utf-8")
-SCRIPT = (STATIC / "page.js").read_text("utf-8")
+MODULES = {path.name: path.read_text("utf-8") for path in sorted(STATIC.glob("*.js"))}
+SCRIPT = "\n".join(MODULES.values())
 STYLE = (STATIC / "page.css").read_text("utf-8")
 FACTS = {"up_axis": "Z", "metres_per_unit": 0.01, "settings": {"tiers": ["screen", "probe", "sky"], "samples": 4}}
 
@@ -87,6 +90,25 @@ def test_nothing_comes_from_elsewhere_and_nothing_is_inline() -> None:
     assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\b", SCRIPT)
 
 
+def test_every_file_is_short() -> None:
+    lengths = {path.name: len(path.read_text("utf-8").splitlines()) for path in STATIC.rglob("*") if path.is_file()}
+    assert {name: lines for name, lines in lengths.items() if lines > 400} == {}
+
+
+def test_modules_take_what_others_give_and_never_each_other_in_a_ring() -> None:
+    taken = {name: re.findall(r'^import \{ (.*) \} from "\./([\w.]+)";$', text, re.M) for name, text in MODULES.items()}
+    assert sum(map(len, taken.values())) == len(re.findall(r"\bimport\b", SCRIPT)) > 20
+    for rows in taken.values():
+        for names, where in rows:
+            given = set(re.findall(r"^export (?:async )?(?:const|let|function|class) ([\w$]+)", MODULES[where], re.M))
+            assert set(names.split(", ")) <= given, where
+    below = {name: {where for _, where in rows} for name, rows in taken.items()}
+    assert set(MODULES) - {"page.js"} == set().union(*below.values())  # the first one alone stands in the markup
+    while leaves := {name for name, rows in below.items() if not rows & below.keys()}:
+        below = {name: rows for name, rows in below.items() if name not in leaves}
+    assert below == {}
+
+
 def test_views_are_planes_of_a_frame() -> None:
     views = re.findall(r'<option value="([\w.]+)">', MARKUP[MARKUP.index('id="view"') :].split("</select>")[0])
     assert len(views) == len(set(views)) > 10
@@ -130,13 +152,17 @@ def test_contrast(palette: dict[str, str], front: str, back: str, least: float) 
 def module(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if shutil.which("node") is None:
         pytest.skip("node is not installed")
-    copy = tmp_path_factory.mktemp("page") / "page.mjs"
-    copy.write_text(SCRIPT, "utf-8")
-    return copy
+    folder = tmp_path_factory.mktemp("page")
+    (folder / "package.json").write_text('{"type": "module"}')
+    for name, text in MODULES.items():
+        (folder / name).write_text(text, "utf-8")
+    names = [name for name in MODULES if name != "page.js"]  # that one begins the page; no other needs a document
+    (folder / "all.js").write_text("".join(f'export * from "./{name}";' for name in names))
+    return folder / "all.js"
 
 
 def js(module: Path, expression: str, **given: Any) -> Any:
-    """Value of an expression over the exports of page.js (as `page`) and `given`."""
+    """Value of an expression over what the modules export (as `page`) and `given`."""
     names = "".join(f"const {name} = {json.dumps(value)};" for name, value in given.items())
     load = f"import * as page from {json.dumps(module.as_uri())};"
     command = ["node", "--input-type=module", "--eval", f"{load}{names}console.log(JSON.stringify({expression}))"]
@@ -240,7 +266,7 @@ def test_cli_command_is_one_that_the_command_line_takes(module: Path, tmp_path: 
         "image_width": 64, "image_height": 36, "samples": 2, "tiers": ["ray", "sky"], "screen": "proxy",
         "model": "thin", "max_layers": 2, "exposure": -1.5, "camera": "/World/Camera", "time_code": 3,
     }  # fmt: skip
-    words = run_shell(js(module, "page.asCli({name: 'a b.usda'}, request, null)", request=request), tmp_path)
+    words = run_shell(js(module, "page.asCli({name: 'a b.usda'}, request)", request=request), tmp_path)
     command: Any = typer.main.get_command(app)
     context = command.make_context("refract", words[:1], resilient_parsing=True)
     taken = command.get_command(context, "render").make_context("render", words[1:]).params
@@ -254,31 +280,57 @@ def test_cli_command_is_one_that_the_command_line_takes(module: Path, tmp_path: 
     }  # fmt: skip
 
 
-def test_cli_command_puts_overrides_in_a_layer_that_usd_reads(module: Path, tmp_path: Path) -> None:
-    from pxr import Usd, UsdGeom, UsdShade
+def test_cli_command_says_overrides_as_http_does(module: Path, tmp_path: Path) -> None:
+    from refract_core.cli.render import _materials
 
-    (tmp_path / "glass.usda").write_text(
-        '#usda 1.0\n(\n    upAxis = "Z"\n    metersPerUnit = 0.01\n)\ndef Scope "L"\n{\n    def Material "G"\n    {\n'
-        "        float inputs:refraction:thickness = 1\n"
-        "        float inputs:refraction:thickness.connect = </L/G/T.outputs:r>\n"
-        '        def Shader "T"\n        {\n            float outputs:r\n        }\n    }\n}\n'
-    )
-    override = {"ior": 1.7, "thickness": 2.5, "model": "box", "roughness": 0.2, "transmittanceColor": [1, 0.5, 0.25]}
-    request = {"image_width": 64, "overrides": {"/L/G": override}}
-    command = js(module, "page.asCli({name: 'glass.usda'}, request, facts)", request=request, facts=FACTS)
+    override = {"ior": 1.7, "thickness": 2.5, "model": "box", "roughness": 1e-7, "transmittanceColor": [1, 0.5, 0.25]}
+    request = {"image_width": 64, "overrides": {"/L/It's 'Glass'": override, "/L/Ω": {"ior": 2}}}
+    command = js(module, "page.asCli({name: 'glass.usda'}, request)", request=request)
+    assert "\n" not in command
     words = run_shell(command, tmp_path)
-    assert words[:3] == ["render", "glass_changed.usda", "glass.png"]
-    assert "# roughness 0.2 of /L/G" in command  # it lives in a shader that the page does not know
-    stage = Usd.Stage.Open(str(tmp_path / "glass_changed.usda"))
-    material = UsdShade.Material(stage.GetPrimAtPath("/L/G"))
-    assert UsdGeom.GetStageMetersPerUnit(stage) == 0.01
-    assert UsdGeom.GetStageUpAxis(stage) == "Z"
-    assert material.GetInput("refraction:ior").Get() == pytest.approx(1.7)
-    assert material.GetInput("refraction:thickness").Get() == 2.5
-    assert not material.GetInput("refraction:thickness").HasConnectedSource()
-    assert tuple(material.GetInput("refraction:transmittanceColor").Get()) == (1, 0.5, 0.25)
-    assert material.GetPrim().GetAttribute("refraction:model").Get() == "box"
-    assert material.GetPrim().HasAPI("RefractMaterialAPI")
+    assert words[:5] == ["render", "glass.usda", "glass.png", "--image-width", "64"]
+    given = [value for word, value in pairwise(words) if word == "--override"]
+    expected = {"/L/It's 'Glass'": {**override, "transmittanceColor": (1, 0.5, 0.25)}, "/L/Ω": {"ior": 2}}
+    assert _materials(given) == expected
+
+
+def chunks(png: bytes) -> list[bytes]:
+    """Type and data of each chunk of a PNG, without length and checksum."""
+    found, at = [], 8
+    while at < len(png):
+        size = int.from_bytes(png[at : at + 4], "big")
+        found.append(png[at + 4 : at + 8 + size])
+        at += size + 12
+    return found
+
+
+def test_the_copied_command_makes_the_bytes_that_the_service_makes(module: Path, tmp_path: Path) -> None:
+    """For the request that the page sends: other values in two materials, other tiers, another time."""
+    service_server = pytest.importorskip("service_server")
+    samples = tmp_path / "samples"
+    shutil.copytree(service_server.ROOT / "usd_samples" / "good", samples)
+    amber = {"model": "box", "ior": 1.21, "thickness": 0.3, "roughness": 0.15, "absorptionDistance": 0.7}
+    given = {
+        "image_width": 48, "samples": 2, "tiers": ["ray", "sky"], "exposure": -0.5, "time_code": 3,
+        "overrides": {"/World/Amber": {**amber, "transmittanceColor": [1, 0.5, 0.25]}, "/World/Sea": {"model": "thin"}},
+    }  # fmt: skip
+    wish = "page.requestSettings(page.cleanSettings(given, null), null)"
+    request, command = js(module, f"[{wish}, page.asCli({{name: 'marble.usda'}}, {wish})]", given=given)
+    assert request == given
+    program = tmp_path / "refract"
+    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m refract_core.cli "$@"\n')
+    program.chmod(0o755)
+    where = {"PATH": f"{tmp_path}:/usr/bin:/bin", "PYTHONPATH": str(service_server.ROOT)}
+    subprocess.run(["sh", "-c", command], cwd=samples, check=True, timeout=300, env={**os.environ, **where})
+    serving = service_server.running(tmp_path / "data", "--stage-root", str(samples), "--workers", "1")
+    with serving as server, server.client() as client:
+        sent = client.post("/v1/render", json={"stage": "marble.usda", **request}, timeout=300)
+    assert sent.status_code == 200
+    there, here = chunks(sent.content), chunks((samples / "marble.0003.png").read_bytes())
+    assert [one for one in here if one not in there] == [b"tEXtrefract:stage\0" + bytes(samples / "marble.usda")]
+    assert [one for one in there if one not in here] == [b"tEXtrefract:stage\0marble.usda"]  # no path of the server's
+    (words,) = (one for one in here if b"refract:overrides" in one)
+    assert b"/World/Amber.transmittanceColor=1.0,0.5,0.25 " in words
 
 
 def test_events_come_whole_however_they_are_cut(module: Path) -> None:

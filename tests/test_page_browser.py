@@ -181,7 +181,7 @@ def test_planes_come_in_false_colour_with_a_legend(page: Any) -> None:
     page.get_by_label("Show").select_option("thickness")
     playwright.expect(page.locator("#legend")).to_contain_text("1.24 m")  # white, as the job's record says
     page.wait_for_function(f"() => ({MIDDLE})('canvas-a')[0] !== 0")
-    expected = page.evaluate("async () => (await import('/static/page.js')).falseColour(64 / 255)")
+    expected = page.evaluate("async () => (await import('/static/planes.js')).falseColour(64 / 255)")
     assert page.evaluate(MIDDLE, "canvas-a")[:3] == expected
     page.get_by_label("Show").select_option("picture")
     playwright.expect(page.locator("#legend")).to_be_hidden()
@@ -229,6 +229,10 @@ def test_commands_are_copied(page: Any) -> None:
     page.get_by_role("button", name="Copy as CLI").click()
     assert page.locator("#copied").input_value() == "refract render ball.usda ball.png --image-width 480"
     assert page.evaluate("document.activeElement.id") == "copied"
+    page.get_by_label("Ball: Index of refraction, slider").press("ArrowRight")
+    status(page, "Done.")
+    page.get_by_role("button", name="Copy as CLI").click()
+    assert page.locator("#copied").input_value().endswith(" --override /World/Looks/Ball.ior=1.51")
 
 
 def test_a_token_is_asked_for_where_one_is_needed(page: Any, service: FakeService) -> None:

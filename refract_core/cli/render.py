@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from ..errors import UsageError
 from ..executors import crew_at
+from ..override import COLORS, RANGES
 from ..sequence import Order, render_files
 from .app import Jobs, ProgressMode, app, outcome, words
 
@@ -59,6 +61,16 @@ ModelName = Annotated[
         "--model",
         metavar="none|sphere|box|thin|traced",
         help="Use this refraction model for every refractive material, whatever the stage says.",
+    ),
+]
+Override = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--override",
+        metavar="PATH.FIELD=VALUE",
+        help="Change one value of one material, such as /World/Marble.ior=1.33; may be repeated. PATH is a material, "
+        "or a mesh or sphere bound to it. FIELD is model, ior (1 to 10), thickness, roughness (0 to 1), "
+        "transmittanceColor (red,green,blue, each 0 to 1) or absorptionDistance; lengths are in the stage's units.",
     ),
 ]
 MaxLayers = Annotated[
@@ -123,6 +135,7 @@ def render(
     tiers: Tiers = None,
     screen: Screen = None,
     model: ModelName = None,
+    override: Override = None,
     max_layers: MaxLayers = None,
     aovs: Aovs = "",
     purposes: Purposes = None,
@@ -151,21 +164,44 @@ def render(
         "jobs": jobs,
         "tile_size": tile_size,
     }
-    order = Order(
-        stage=stage,
-        out=out,
-        frames=frames,
-        overrides={name: value for name, value in given.items() if value is not None},
-        settings_prim=render_settings_prim_path,
-        aovs=words(aovs),
-        color_correction=color_correction_mode,
-        complexity=complexity,
-        skip_existing=skip_existing,
-    )
     with outcome(progress) as (report, cancel), crew_at(executor) as crew:
+        order = Order(
+            stage=stage,
+            out=out,
+            frames=frames,
+            overrides={name: value for name, value in given.items() if value is not None},
+            materials=_materials(override or []),
+            settings_prim=render_settings_prim_path,
+            aovs=words(aovs),
+            color_correction=color_correction_mode,
+            complexity=complexity,
+            skip_existing=skip_existing,
+        )
         render_files(order, report, cancel, crew)
 
 
 def _purposes(text: str) -> tuple[str, ...]:
     """usdrecord's rule: default is always drawn."""
     return ("default", *(word for word in words(text) if word != "default"))
+
+
+def _materials(given: list[str]) -> dict[str, dict[str, Any]]:
+    """`PATH.FIELD=VALUE` words by path and field; of two about the same, the last counts."""
+    found: dict[str, dict[str, Any]] = {}
+    for word in given:
+        place, sign, value = word.partition("=")
+        path, dot, field = place.rpartition(".")
+        if not (sign and dot and field and path.startswith("/")):
+            raise UsageError(f"--override is '{word}'; write PATH.FIELD=VALUE, such as /World/Marble.ior=1.33")
+        found.setdefault(path, {})[field] = _value(field, value)
+    return found
+
+
+def _value(field: str, text: str) -> Any:
+    """A text as its field wants it; one that cannot be so stays a text, and is refused with the field's range."""
+    try:
+        if field in COLORS:
+            return tuple(float(part) for part in text.split(","))
+        return float(text) if field in RANGES else text
+    except ValueError:
+        return text

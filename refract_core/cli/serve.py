@@ -20,7 +20,12 @@ StageRoot = Annotated[
     ),
 ]
 Workers = Annotated[
-    int | None, typer.Option(envvar="REFRACT_WORKERS", help="Jobs at once. The default is the number of cores.")
+    int | None,
+    typer.Option(
+        envvar="REFRACT_WORKERS",
+        help="Jobs at once. The default is the number of cores; with --executor it is 32, and the cluster decides how "
+        "many of them really run.",
+    ),
 ]
 Queue = Annotated[int, typer.Option(envvar="REFRACT_QUEUE", help="Jobs that may wait; one more is refused with 429.")]
 Data = Annotated[
@@ -29,6 +34,15 @@ Data = Annotated[
         metavar="FOLDER",
         envvar="REFRACT_DATA",
         help="Where jobs and results are kept, also over a restart. Without it, a new temporary folder.",
+    ),
+]
+Executor = Annotated[
+    str,
+    typer.Option(
+        metavar="dask://HOST:PORT",
+        envvar="REFRACT_EXECUTOR",
+        help="Do the jobs on the Dask cluster with this scheduler, each in a locked process there. Without it, on this "
+        "machine.",
     ),
 ]
 TokenFile = Annotated[
@@ -51,6 +65,10 @@ Limit = Annotated[
 ShowLimits = Annotated[bool, typer.Option("--limits", help="Print every limit with its value, and exit.")]
 
 
+_SENT = 32
+"""Jobs that a cluster has at once."""
+
+
 @app.command()
 def serve(
     host: Host = "127.0.0.1",
@@ -59,6 +77,7 @@ def serve(
     workers: Workers = None,
     queue: Queue = 16,
     data: Data = "",
+    executor: Executor = "",
     token_file: TokenFile = "",
     limit: Limit = None,
     limits: ShowLimits = False,
@@ -79,8 +98,8 @@ def serve(
         from service.serve import serve as run
 
         settings = Settings(
-            stage_root=stage_root, data=data, workers=workers or os.cpu_count() or 1, queue=queue,
-            tokens=_tokens(token_file), limits=chosen,
+            stage_root=stage_root, data=data, executor=executor, queue=queue, tokens=_tokens(token_file), limits=chosen,
+            workers=workers or (_SENT if executor else os.cpu_count() or 1),
         )  # fmt: skip
         run(settings, host, port)
 

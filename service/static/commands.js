@@ -1,0 +1,35 @@
+// The render on the page as a command for a shell.
+
+/** One word of a POSIX shell. */
+export function quoted(word) {
+  return /^[\w./:,=@%+-]+$/.test(word) ? word : `'${word.replaceAll("'", `'\\''`)}'`;
+}
+
+/** The same render by curl. A file is named as it was here: run it beside that file. */
+export function asCurl(url, source, request) {
+  const end = `${quoted(url)} -o ${quoted(pictureName(source.name))}`;
+  if (!source.file) {
+    const body = JSON.stringify({ stage: source.name, ...request });
+    return `curl --fail-with-body -H 'Content-Type: application/json' -d ${quoted(body)} ${end}`;
+  }
+  const file = /[;,"\\]/.test(source.name) ? `"${source.name.replace(/[\\"]/g, "\\$&")}"` : source.name;
+  return `curl --fail-with-body -F ${quoted(`stage=@${file}`)} --form-string ${quoted(`settings=${JSON.stringify(request)}`)} ${end}`;
+}
+
+export const pictureName = (name) => `${name.replace(/^.*\//, "").replace(/\.usd[acz]?$/i, "")}.png`;
+
+/** The same render by the command line. */
+export function asCli(source, request) {
+  const { overrides = {}, time_code: time = null, ...flags } = request;
+  const hashes = time === null ? "" : Number.isInteger(time) ? ".####" : ".####.###";
+  const words = ["refract", "render", source.name, pictureName(source.name).replace(/\.png$/, `${hashes}.png`)];
+  for (const [name, value] of Object.entries(flags)) {
+    const flag = `--${name.replaceAll("_", "-")}`;
+    words.push(...(value < 0 ? [`${flag}=${value}`] : [flag, String(value)]));
+  }
+  for (const [path, fields] of Object.entries(overrides)) {
+    for (const [name, value] of Object.entries(fields)) words.push("--override", `${path}.${name}=${value}`);
+  }
+  if (time !== null) words.push(...(time < 0 ? [`--frames=${time}`] : ["--frames", String(time)]));
+  return words.map(quoted).join(" ");
+}

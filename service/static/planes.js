@@ -1,0 +1,18 @@
+// The planes of a picture that can be looked at, and numbers as colours.
+
+// Planes of one number per pixel are drawn in false colour. Those with a unit are not between 0 and 1: white in their
+// PNG stands for what the job's record says.
+export const UNITS = { thickness: " m", path_length: " m", layers: "" };
+
+export const SCALARS = ["weight.screen", "weight.ray", "weight.probe", "weight.sky", "weight.none", "confidence", "mask", ...Object.keys(UNITS)];
+export const AOVS = [...SCALARS, "refraction", "reflection", "transmittance", "N"];
+
+// Dark to light in steps of even lightness, so that the order survives colour blindness and grey print.
+export const RAMP = [[24, 15, 61], [66, 40, 133], [33, 102, 153], [20, 150, 136], [110, 191, 84], [236, 221, 92], [255, 250, 220]];
+
+/** [red, green, blue] 0 .. 255 of a share 0 .. 1. */
+export function falseColour(share) {
+  const at = Math.min(Math.max(share, 0), 1) * (RAMP.length - 1);
+  const low = Math.min(Math.floor(at), RAMP.length - 2);
+  return RAMP[low].map((from, channel) => Math.round(from + (RAMP[low + 1][channel] - from) * (at - low)));
+}

@@ -1,0 +1,55 @@
+// What may be asked of a render: the words, what is usual, and what of a stranger's settings is kept.
+
+export const TIERS = ["screen", "ray", "probe", "sky"];
+export const MODELS = ["none", "sphere", "box", "thin", "traced"];
+export const SCREENS = ["march", "proxy"];
+export const NUMBERS = ["image_width", "image_height", "samples", "max_layers", "exposure", "time_code"];
+const GLASS_NUMBERS = ["ior", "thickness", "roughness", "absorptionDistance"];
+
+/** What a render of this stage does when nothing is asked, and a size that suits a page. */
+export function defaultSettings(facts) {
+  const authored = facts?.settings ?? {};
+  return {
+    camera: "", time_code: null, image_width: 480, image_height: 0, samples: authored.samples ?? 4, exposure: 0,
+    tiers: [...(authored.tiers ?? ["screen", "probe", "sky"])], screen: "march", model: "",
+    max_layers: authored.max_layers ?? 4, overrides: {},
+  };
+}
+
+/** The request's settings: what differs from what the stage would do by itself, and always the width. */
+export function requestSettings(settings, facts) {
+  const usual = defaultSettings(facts);
+  const request = { image_width: settings.image_width };
+  for (const [name, value] of Object.entries(settings)) {
+    if (JSON.stringify(value) !== JSON.stringify(usual[name])) request[name] = value;
+  }
+  return request;
+}
+
+const isNumber = (value) => typeof value === "number" && Number.isFinite(value);
+const isColour = (value) => Array.isArray(value) && value.length === 3 && value.every(isNumber);
+
+/** Settings out of a link: known names with values of their kind; all else is dropped. */
+export function cleanSettings(given, facts) {
+  const clean = defaultSettings(facts);
+  if (!given || typeof given !== "object") return clean;
+  for (const name of NUMBERS) if (isNumber(given[name])) clean[name] = given[name];
+  if (typeof given.camera === "string") clean.camera = given.camera;
+  if (SCREENS.includes(given.screen)) clean.screen = given.screen;
+  if (MODELS.includes(given.model)) clean.model = given.model;
+  const tiers = Array.isArray(given.tiers) ? TIERS.filter((tier) => given.tiers.includes(tier)) : [];
+  if (tiers.length) clean.tiers = tiers.sort((one, two) => given.tiers.indexOf(one) - given.tiers.indexOf(two));
+  for (const [path, override] of Object.entries(given.overrides ?? {})) {
+    const kept = cleanOverride(override);
+    if (path.startsWith("/") && Object.keys(kept).length) clean.overrides[path] = kept;
+  }
+  return clean;
+}
+
+function cleanOverride(override) {
+  const kept = {};
+  for (const name of GLASS_NUMBERS) if (isNumber(override?.[name])) kept[name] = override[name];
+  if (MODELS.includes(override?.model)) kept.model = override.model;
+  if (isColour(override?.transmittanceColor)) kept.transmittanceColor = [...override.transmittanceColor];
+  return kept;
+}

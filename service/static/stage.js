@@ -1,0 +1,84 @@
+// Which stage is looked at: a sample of the server, or a file that is dropped or chosen.
+
+import { bodyOf, send } from "./api.js";
+import { $, make } from "./dom.js";
+import { drawChoices } from "./form.js";
+import { changed, stopAll } from "./jobs.js";
+import { clearProblem, report } from "./problems.js";
+import { cleanSettings } from "./settings.js";
+import { state, tell } from "./state.js";
+
+export async function listSamples() {
+  try {
+    const { stages } = await (await send("v1/stages")).json();
+    const names = stages.map(({ path }) => path);
+    $("sample").replaceChildren(make("option", { value: "", textContent: "none" }),
+      ...names.map((name) => make("option", { value: name, textContent: name })));
+  } catch (error) {
+    report(error);
+  }
+}
+
+/** Look into a stage, then draw its controls. `link` carries the settings of a shared link. */
+export async function choose(source, link = null) {
+  stopAll();
+  const waiting = (state.source = source);
+  Object.assign(state, { facts: null, runs: { a: null, b: null } });
+  clearProblem();
+  tell("all");
+  $("facts").textContent = `Looking into ${source.name} …`;
+  try {
+    const { body, headers } = bodyOf({});
+    const facts = await (await send("v1/inspect", { method: "POST", body, headers })).json();
+    if (state.source !== waiting) return;
+    state.facts = facts;
+  } catch (error) {
+    if (state.source !== waiting) return;
+    state.source = null;
+    $("facts").textContent = `${source.name} could not be opened.`;
+    report(error);
+    return;
+  }
+  const wanted = link ?? (state.keep ? state.keep : null);
+  state.keep = null;
+  state.settings = { a: cleanSettings(wanted?.a, state.facts), b: cleanSettings(wanted?.b ?? wanted?.a, state.facts) };
+  state.compare = Boolean(wanted?.b);
+  $("facts").textContent = factsText(source.name, state.facts);
+  drawChoices();
+  tell("all");
+  changed();
+}
+
+function factsText(name, facts) {
+  const objects = facts.glass?.length ?? 0;
+  const worry = (facts.suspicious?.length ?? 0) + (facts.unsupported?.length ?? 0);
+  return `${name}: ${counted(objects, "glass object")}, ${counted(facts.cameras?.length ?? 0, "camera")}, ` +
+    `${counted(facts.probes?.length ?? 0, "probe")}, ${facts.up_axis} up, ${facts.metres_per_unit} m per unit` +
+    (worry ? `; ${counted(worry, "thing")} to look at, under Notices.` : ".");
+}
+
+const counted = (count, noun) => `${count} ${noun}${count === 1 ? "" : "s"}`;
+
+function openFile(file) {
+  if (!file) return;
+  $("sample").value = "";
+  choose({ name: file.name, file });
+}
+
+export function wireStage() {
+  const drop = $("drop");
+  $("sample").onchange = ({ target }) => { if (target.value) { $("file").value = ""; choose({ name: target.value }); } };
+  $("file").onchange = () => openFile($("file").files[0]);
+  document.ondragover = (event) => {
+    if (!event.dataTransfer.types.includes("Files")) return;
+    event.preventDefault();
+    drop.classList.add("over");
+  };
+  document.ondragleave = () => drop.classList.remove("over");
+  document.ondrop = (event) => {
+    drop.classList.remove("over");
+    if (!event.dataTransfer.files.length) return;
+    event.preventDefault();
+    openFile(event.dataTransfer.files[0]);
+  };
+}
