@@ -1,7 +1,7 @@
 """Work on other machines: a stage told to workers, pieces of work sent out, results that each come back once.
 
 What spreads is a frame or a probe. The code knows `concurrent.futures` alone, but for the functions that know Dask:
-`crew_at`, which finds the cluster, and `_desk`, which asks a worker whether anybody still waits for its result.
+`crew_at`, which finds the cluster, and `desk`, which asks a worker whether anybody still waits for its result.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from .scene import Notice, Scene
 from .version import __version__
 
 _ADDRESS = re.compile(r"dask://([^\s/:]+|\[[0-9A-Fa-f:.]+\]):(\d{1,5})/?")
-_CONNECT_SECONDS = 10
+CONNECT_SECONDS = 10
 _OPEN_STAGES = 4
 """Stages of different orders that a worker keeps open."""
 _SAME = "install the same usd-refract[dask] on the scheduler and all workers, and start them again"
@@ -63,32 +63,53 @@ def crew_at(address: str) -> Iterator[Crew | None]:
     if not address:
         yield None
         return
-    found = _ADDRESS.fullmatch(address)
-    if found is None or int(found[2]) > 65535:
-        raise UsageError(f"--executor is '{address}'; write dask://HOST:PORT, the address that `dask scheduler` prints")
-    try:
-        from distributed import Client, Security
-    except ImportError as error:
-        raise UsageError(
-            f"--executor {address} needs Dask, which is not installed: pip install 'usd-refract[dask]'"
-        ) from error
-    scheme = "tls" if getattr(Security(), "tls_ca_file", None) else "tcp"  # as Dask's own configuration says
-    with _silent("distributed", "distributed.client"):  # what they say about lost connections comes as an error here
+    scheduler = scheduler_of(address)
+    from distributed import Client
+
+    with silent("distributed", "distributed.client"):  # what they say about lost connections comes as an error here
         try:
-            client = Client(f"{scheme}://{found[1]}:{found[2]}", timeout=_CONNECT_SECONDS, set_as_default=False)
+            client = Client(scheduler, timeout=CONNECT_SECONDS, set_as_default=False)
         except (OSError, ValueError) as error:
-            raise RefractError(
-                f"--executor {address}: no Dask scheduler answers there; start one with `dask scheduler`, or check "
-                "host, port and firewall"
-            ) from error
+            raise RefractError(nobody_at(address)) from error
         try:
             yield _crew_of(client)
         finally:
             client.close()
 
 
+def scheduler_of(address: str) -> str:
+    """A scheduler's address as Dask writes it.
+
+    Args:
+        address: `dask://HOST:PORT`
+
+    Raises:
+        UsageError: it is malformed, or Dask is not installed.
+    """
+    found = _ADDRESS.fullmatch(address)
+    if found is None or int(found[2]) > 65535:
+        raise UsageError(f"--executor is '{address}'; write dask://HOST:PORT, the address that `dask scheduler` prints")
+    try:
+        from distributed import Security
+    except ImportError as error:
+        raise UsageError(
+            f"--executor {address} needs Dask, which is not installed: pip install 'usd-refract[dask]'"
+        ) from error
+    scheme = "tls" if getattr(Security(), "tls_ca_file", None) else "tcp"  # as Dask's own configuration says
+    return f"{scheme}://{found[1]}:{found[2]}"
+
+
+def nobody_at(address: str) -> str:
+    """What to tell where no scheduler answers."""
+    return (
+        f"--executor {address}: no Dask scheduler answers there; start one with `dask scheduler`, or check host, port "
+        "and firewall"
+    )
+
+
 @contextmanager
-def _silent(*names: str) -> Iterator[None]:
+def silent(*names: str) -> Iterator[None]:
+    """Loggers that say nothing for a while, because what they know is told in another way."""
     loggers = {name: logging.getLogger(name) for name in names}
     before = {name: logger.level for name, logger in loggers.items()}
     for logger in loggers.values():
@@ -255,7 +276,7 @@ def _hashed(files: Sequence[str]) -> tuple[tuple[str, str], ...]:
 # --- in a worker
 
 
-class _Desk(NamedTuple):
+class Desk(NamedTuple):
     """What a worker's process offers to a piece of work."""
 
     cancel: Callable[[], bool]
@@ -264,22 +285,22 @@ class _Desk(NamedTuple):
     """for files that only live as long as the worker"""
 
 
-def _desk() -> _Desk:
+def desk() -> Desk:
     """The desk of this thread. On Dask, work that is cancelled runs on unless it asks."""
     distributed = sys.modules.get("distributed")
     if distributed is None:
-        return _Desk(lambda: False, None)
+        return Desk(lambda: False, None)
     try:
         worker = distributed.get_worker()
         key = worker.get_current_task()
     except (ValueError, KeyError):  # not on a worker: Dask is only loaded
-        return _Desk(lambda: False, None)
+        return Desk(lambda: False, None)
 
     def cancel() -> bool:
         task = worker.state.tasks.get(key)
         return task is None or task.state == "cancelled"
 
-    return _Desk(cancel, worker.local_directory)
+    return Desk(cancel, worker.local_directory)
 
 
 @dataclass(frozen=True)
@@ -330,13 +351,13 @@ def _perform(function: Callable[[Bench, Any], Any], sent: Sent, shared: bytes | 
     if sent.version != __version__:
         where = socket.gethostname()
         raise RefractError(f"the worker on {where} has refract {__version__}, not {sent.version}; {_SAME}")
-    desk = _desk()
+    here = desk()
     with _reading:
-        opened = _opened(sent, shared, desk)
-    return _NOT_HERE if opened is None else (function(Bench(sent, opened, desk.cancel), item),)
+        opened = _opened(sent, shared, here)
+    return _NOT_HERE if opened is None else (function(Bench(sent, opened, here.cancel), item),)
 
 
-def _opened(sent: Sent, shared: bytes | None, desk: _Desk) -> _Opened | None:
+def _opened(sent: Sent, shared: bytes | None, here: Desk) -> _Opened | None:
     from .usd.stage import open_stage
 
     if sent.order in _open:
@@ -346,7 +367,7 @@ def _opened(sent: Sent, shared: bytes | None, desk: _Desk) -> _Opened | None:
     elif shared is None:
         return None
     else:
-        folder = tempfile.mkdtemp(prefix="refract-stage-", dir=desk.folder)
+        folder = tempfile.mkdtemp(prefix="refract-stage-", dir=here.folder)
         path = os.path.join(folder, f"{Path(sent.stage).stem}.usdz")
         Path(path).write_bytes(shared)
         opened = _Opened(open_stage(path), path)
@@ -368,7 +389,7 @@ def _is_here(sent: Sent) -> bool:
 
 def file_bytes(write: Callable[[str], None], name: str) -> bytes:
     """The bytes of a file that `write` would write under this name."""
-    with tempfile.TemporaryDirectory(prefix="refract-", dir=_desk().folder) as folder:
+    with tempfile.TemporaryDirectory(prefix="refract-", dir=desk().folder) as folder:
         path = os.path.join(folder, os.path.basename(name))
         write(path)
         return Path(path).read_bytes()

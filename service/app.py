@@ -18,13 +18,15 @@ from starlette.exceptions import HTTPException as StarletteHTTPException
 from starlette.routing import Match
 
 from refract_core.errors import UsageError
+from refract_core.executors import scheduler_of
 from refract_core.version import __version__
 
-from . import pages, routes
+from . import openapi, pages, routes
 from .edge import Edge
 from .jobs import Jobs
 from .limits import Limits
 from .metrics import CONTENT_TYPE, Metrics
+from .pool import Nursery, Source
 from .problems import BY_STATUS, KINDS, MEDIA_TYPE, Problem, respond
 from .store import Store
 
@@ -44,6 +46,8 @@ class Settings:
     """Jobs at once."""
     queue: int = 16
     """Jobs that may wait."""
+    executor: str = ""
+    """Address of a Dask cluster that does the jobs, `dask://HOST:PORT`; '' does them on this machine."""
     tokens: tuple[str, ...] = ()
     """Bearer tokens, one of which every request under /v1 must bring; none means open to all."""
     limits: Limits = field(default_factory=Limits)
@@ -53,6 +57,8 @@ class Settings:
             raise UsageError(f"--workers is {self.workers}; it must be between 1 and 256")
         if not 0 <= self.queue <= 100_000:
             raise UsageError(f"--queue is {self.queue}; it must be between 0 and 100000")
+        if self.executor:
+            scheduler_of(self.executor)
         if self.stage_root and not Path(self.stage_root).is_dir():
             raise UsageError(f"--stage-root {self.stage_root}: there is no such folder")
         if any(len(token) < 8 for token in self.tokens):
@@ -73,8 +79,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         raise UsageError(f"--data {settings.data}: cannot be used: {error.strerror}") from error
     root = Path(settings.stage_root).resolve() if settings.stage_root else None
     jobs = Jobs(
-        store, settings.limits, metrics, workers=settings.workers, queue=settings.queue, stage_root=root
-    )
+        store, settings.limits, metrics, _source(settings), workers=settings.workers, queue=settings.queue,
+        stage_root=root,
+    )  # fmt: skip
 
     @contextlib.asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -93,8 +100,26 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     _add_handlers(app)
     _add_pages(app, settings, metrics)
     app.include_router(routes.router)
-    app.mount("/static", StaticFiles(directory=_STATIC, check_dir=False), name="static")
+    openapi.describe(app, tokens=bool(settings.tokens))
+    app.mount("/static", _Static(directory=_STATIC), name="static")
     return app
+
+
+class _Static(StaticFiles):
+    """The page's files. A browser asks each time: after an upgrade it must not mix old modules with new ones."""
+
+    def file_response(self, *arguments: Any, **options: Any) -> Response:
+        answer = super().file_response(*arguments, **options)
+        answer.headers["Cache-Control"] = "no-cache"
+        return answer
+
+
+def _source(settings: Settings) -> Source:
+    if not settings.executor:
+        return Nursery()
+    from .cluster import Cluster
+
+    return Cluster(settings.executor)
 
 
 def _add_handlers(app: FastAPI) -> None:
@@ -129,8 +154,9 @@ def _add_handlers(app: FastAPI) -> None:
 
 def _methods_here(request: Request) -> list[str]:
     """Methods of a path. Starlette names those of the first route that fits, and a path may have several."""
-    fitting = [route for route in request.app.routes if route.matches(request.scope)[0] is not Match.NONE]
-    return sorted({method for route in fitting for method in getattr(route, "methods", None) or ()})
+    known = [*request.app.routes, *routes.router.routes]  # FastAPI shows the second as one, which has no methods
+    fitting = [route for route in known if route.matches(request.scope)[0] is not Match.NONE]
+    return sorted({method for route in fitting for method in getattr(route, "methods", None) or ()}) or ["GET"]
 
 
 def _add_pages(app: FastAPI, settings: Settings, metrics: Metrics) -> None:
@@ -144,12 +170,12 @@ def _add_pages(app: FastAPI, settings: Settings, metrics: Metrics) -> None:
     async def readyz(request: Request) -> JSONResponse:
         """Whether a worker is warm, with what confines it on this machine."""
         jobs: Jobs = request.app.state.jobs
-        if jobs.draining or not jobs.nursery.ready.is_set():
-            why = "the service is about to stop" if jobs.draining else "the first worker is not warm yet"
+        if jobs.draining or not jobs.source.ready.is_set():
+            why = "the service is about to stop" if jobs.draining else "no worker is warm yet"
             raise Problem("unavailable", why, headers={"Retry-After": "2"})
         if not jobs.store.writable():
             raise Problem("unavailable", "the folder of jobs cannot be written", headers={"Retry-After": "30"})
-        return JSONResponse({"status": "ready", "confinement": jobs.nursery.report})
+        return JSONResponse({"status": "ready", "confinement": jobs.source.report})
 
     @app.get("/metrics", summary="For Prometheus", response_class=Response)
     async def prometheus() -> Response:

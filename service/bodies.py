@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, NoReturn
 from pydantic import ValidationError
 from starlette.datastructures import UploadFile
 from starlette.exceptions import HTTPException
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.types import Message
 
 from .limits import Limits
@@ -43,6 +43,8 @@ async def read_wish(request: Request, model: type[StageOnly], limits: Limits, fo
     try:
         async with asyncio.timeout(limits.body_seconds):
             return await _read(request, model, limits, folder)
+    except ClientDisconnect:
+        raise Problem("bad-request", "the body ended before it was complete") from None
     except TimeoutError:
         raise Problem("request-timeout", f"the body did not arrive within {limits.body_seconds} s") from None
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import hmac
+import re
 import secrets
 import time
 from collections.abc import Sequence
@@ -13,11 +14,15 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from .metrics import Metrics
-from .problems import Problem, respond
+from .problems import MEDIA_TYPE, Problem, of_status, respond
 
 _LINGER = 2.0
 """[s] A client that is still sending when it is refused would lose the answer if the connection closed at once."""
+_RANGE = re.compile(rb"bytes=\s*(\d{0,18})-(\d{0,18})\s*", re.IGNORECASE)
 _POLICY = "default-src 'self'; img-src 'self' blob: data:; object-src 'none'; base-uri 'none'; frame-ancestors 'none'"
+GUARDS = ((b"x-content-type-options", b"nosniff"), (b"referrer-policy", b"no-referrer"),
+          (b"content-security-policy", _POLICY.encode()))  # fmt: skip
+"""Headers that every answer carries."""
 
 
 class Edge:
@@ -36,36 +41,45 @@ class Edge:
         expects = headers.get("expect", "").lower() == "100-continue"
         identifier = secrets.token_hex(8)
         scope.setdefault("state", {})["request_id"] = identifier
+        inner, answered = _for_the_app(scope), False
 
         async def hear() -> Message:
             nonlocal unread
+            if answered:
+                return {"type": "http.disconnect"}
             message = await receive()
             if not message.get("more_body"):
                 unread = False
             return message
 
         async def say(message: Message) -> None:
+            nonlocal answered
+            if answered:
+                return
             if message["type"] == "http.response.start":
-                route = getattr(scope.get("route"), "path", "none")
+                message, body = _as_problem(message)
+                route = getattr(inner.get("route"), "path", "none")
                 self.metrics.requests.labels(route, str(message["status"])).inc()
-                message["headers"] = [*message["headers"], (b"x-request-id", identifier.encode()),
-                                      (b"x-content-type-options", b"nosniff"), (b"referrer-policy", b"no-referrer"),
-                                      (b"content-security-policy", _POLICY.encode())]  # fmt: skip
+                message["headers"] = [*message["headers"], (b"x-request-id", identifier.encode()), *GUARDS]
                 if unread:
                     message["headers"].append((b"connection", b"close"))
-            last = message["type"] == "http.response.body" and not message.get("more_body")
-            if last and unread and not expects:
+                await send(message)
+                if body is None and scope["method"] != "HEAD":
+                    return
+                message = {"type": "http.response.body", "body": b"" if scope["method"] == "HEAD" else body}
+            answered = not message.get("more_body")
+            if answered and unread and not expects:
                 await send({**message, "more_body": True})
-                await _drain(hear)
+                await _drain(receive)
                 message = {"type": "http.response.body", "body": b"", "more_body": False}
             await send(message)
 
         problem = self._refusal(scope, headers)
-        await (respond(problem) if problem else self.app)(scope, hear, say)
+        await (respond(problem) if problem else self.app)(inner, hear, say)
 
     def _refusal(self, scope: Scope, headers: Headers) -> Problem | None:
         path = scope["path"]
-        if self.tokens and (path == "/metrics" or path.startswith("/v1/")):
+        if self.tokens and guarded(path):
             scheme, _, given = headers.get("authorization", "").partition(" ")
             matches = [hmac.compare_digest(given.strip().encode(), token) for token in self.tokens]
             if scheme.lower() != "bearer" or not any(matches):
@@ -74,6 +88,44 @@ class Edge:
         if scope["method"] not in ("GET", "HEAD", "OPTIONS") and origin and not _same_host(origin, headers):
             return Problem("cross-origin", "a page of another site may not ask for work here")
         return None
+
+
+def guarded(path: str) -> bool:
+    """Where a token is asked for, if there are any. The page and the documentation are for everybody."""
+    return path == "/metrics" or path.startswith("/v1/")
+
+
+def _for_the_app(scope: Scope) -> Scope:
+    """HEAD is GET whose body is left out. Of ranges the app is given only those that are right: others count for
+    nothing (RFC 9110, 14.2), and so do several at once."""
+    head = scope["method"] == "HEAD"
+    kept = [
+        (name, value) for name, value in scope["headers"] if name != b"range" or not (head or _is_no_range(value))
+    ]
+    return {**scope, "method": "GET" if head else scope["method"], "headers": kept}
+
+
+def _is_no_range(value: bytes) -> bool:
+    found = _RANGE.fullmatch(value)
+    if not found or found.groups() == (b"", b""):
+        return True
+    first, last = found.groups()
+    return bool(first and last) and int(last) < int(first)
+
+
+def _as_problem(message: Message) -> tuple[Message, bytes | None]:
+    """The start of an answer; for an error that a library tells in its own way, that of a problem document instead,
+    and the document."""
+    headers = {name.lower(): value for name, value in message["headers"]}
+    allowed = headers.get(b"allow", b"").split(b", ")
+    if b"GET" in allowed and b"HEAD" not in allowed:
+        message = {**message, "headers": [*((n, v) for n, v in message["headers"] if n.lower() != b"allow"),
+                                          (b"allow", headers[b"allow"] + b", HEAD")]}  # fmt: skip
+    if message["status"] < 400 or headers.get(b"content-type") == MEDIA_TYPE.encode():
+        return message, None
+    answer = respond(of_status(message["status"]))
+    kept = [(name, headers[name]) for name in (b"allow", b"content-range") if name in headers]
+    return {**message, "headers": [*answer.raw_headers, *kept]}, bytes(answer.body)
 
 
 def _same_host(origin: str, headers: Headers) -> bool:

@@ -19,9 +19,10 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from .digests import engine
 from .limits import Limits
 from .metrics import Metrics
-from .pool import Nursery, Worker
+from .pool import Source, Worker
 from .problems import KINDS, Problem
 from .store import Record, Store, now
 
@@ -48,18 +49,26 @@ class Jobs:
     """All jobs of one app."""
 
     def __init__(
-        self, store: Store, limits: Limits, metrics: Metrics, *, workers: int, queue: int, stage_root: Path | None
-    ) -> None:
-        self.store, self.limits, self.metrics = store, limits, metrics
+        self, store: Store, limits: Limits, metrics: Metrics, source: Source, *, workers: int, queue: int,
+        stage_root: Path | None,
+    ) -> None:  # fmt: skip
+        """
+        Args:
+            source: of workers.
+            workers: jobs at once.
+            queue: jobs that may wait.
+        """
+        self.store, self.limits, self.metrics, self.source = store, limits, metrics, source
         self.workers, self.places, self.stage_root = workers, workers + queue, stage_root
-        self.nursery = Nursery()
         self.records = store.load_all()
         self.draining = False
         self.streams = 0
         self._held = 0
         self._active: set[str] = set()
         self._line: asyncio.Queue[str] = asyncio.Queue()
-        self._running: dict[str, Worker] = {}
+        self._given: dict[int, Worker] = {}
+        """By `id` of the record: one that was cancelled and asked for again has two for a moment."""
+        self._running: set[int] = set()
         self._waiters: Counter[str] = Counter()
         self._kept: set[str] = set()
         self._news: dict[str, asyncio.Event] = {}
@@ -69,7 +78,7 @@ class Jobs:
     # --- life -------------------------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        self.nursery.start()
+        self.source.start()
         self._tasks = [asyncio.create_task(self._slot()) for _ in range(self.workers)]
         self._tasks.append(asyncio.create_task(self._sweep()))
 
@@ -84,7 +93,7 @@ class Jobs:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        await self.nursery.stop()
+        await self.source.stop()
 
     # --- in ---------------------------------------------------------------------------------------------------------
 
@@ -167,17 +176,17 @@ class Jobs:
         if record.ended:
             return
         self._end(record, "cancelled", Problem("cancelled", "the job was cancelled"))
-        if worker := self._running.get(record.id):
-            await self.nursery.kill(worker)
+        if worker := self._given.get(id(record)):
+            await self.source.kill(worker)
 
     # --- work -------------------------------------------------------------------------------------------------------
 
     async def _slot(self) -> None:
         """One worker after the other, each made before there is a job for it."""
         while True:
-            worker, work = await self.nursery.fork(), self.store.new_work()
+            worker, work = await self.source.fork(), self.store.new_work()
+            record = None
             try:
-                record = None
                 while record is None or record.ended:
                     record = self.records.get(await self._line.get())
                 worker = await self._begin(record, worker, work)
@@ -187,12 +196,14 @@ class Jobs:
                 if record is not None and not record.ended:
                     self._end(record, "failed", Problem("internal", "the service could not do this job"))
             finally:
-                await self.nursery.kill(worker)
+                if record is not None:
+                    self._given.pop(id(record), None)
+                await self.source.kill(worker)
                 worker.close()
                 self.store.drop_work(work)
 
     async def _begin(self, record: Record, worker: Worker, work: Path) -> Worker:
-        """Give a job to a worker; to another one where it died while it waited, which is not the job's fault."""
+        """Give a job to a worker; to another one where it ended while it waited, which is not the job's fault."""
         root = self.stage_root
         if record.uploaded:
             root = work / "in"
@@ -203,12 +214,13 @@ class Jobs:
             "settings": {**record.settings, "threads": threads}, "limits": asdict(self.limits),
         }  # fmt: skip
         while True:
+            self._given[id(record)] = worker
             with contextlib.suppress(ConnectionError):
                 await worker.give(order)
-                if await worker.hear() == {"began": True}:
+                if await worker.hear() == {"began": True} or record.ended:
                     return worker
             worker.close()
-            worker = await self.nursery.fork()
+            worker = await self.source.fork()
 
     async def _run(self, record: Record, worker: Worker, work: Path) -> None:
         if record.ended:
@@ -218,7 +230,7 @@ class Jobs:
         self.metrics.waited.observe(waited.total_seconds())
         record.status, record.started, record.stage_of_work = "running", now(), "starting"
         self.store.save(record)
-        self._running[record.id] = worker
+        self._running.add(id(record))
         self._count()
         self._tell(record)
         problem: Problem | None = None
@@ -226,11 +238,10 @@ class Jobs:
             async with asyncio.timeout(self.limits.job_seconds):
                 problem = await self._listen(record, worker, work)
         except TimeoutError:
-            await self.nursery.kill(worker)
+            await self.source.kill(worker)
             problem = Problem("time-limit", f"the job was stopped after {self.limits.job_seconds} s")
         finally:
-            if self._running.get(record.id) is worker:
-                del self._running[record.id]
+            self._running.discard(id(record))
             self._count()
         if record.ended:
             return
@@ -259,7 +270,7 @@ class Jobs:
                 return None
             except ValidationError:
                 pass
-        await self.nursery.kill(worker)
+        await self.source.kill(worker)
         code = await worker.code
         if record.ended:  # cancelled, which is why
             return None
@@ -345,39 +356,3 @@ def _crash_of(record: Record, code: int, work: Path) -> Problem:
         return Problem("memory-limit", "the job ran out of memory")
     how = f"signal {-code}" if code < 0 else f"code {code}"
     return Problem("stage-crashed", f"the worker that read the stage ended with {how}")
-
-
-# --- digests ----------------------------------------------------------------------------------------------------------
-
-_ENGINE: list[str] = []
-
-
-def engine() -> str:
-    """Version of all that makes a result: release and sources."""
-    if not _ENGINE:
-        from refract_core.version import __version__
-
-        digest = hashlib.sha256()
-        here = Path(__file__).resolve().parents[1]
-        for path in sorted([*(here / "refract_core").rglob("*.py"), *(here / "service").glob("*.py")]):
-            digest.update(path.read_bytes())
-        _ENGINE.append(f"{__version__}+{digest.hexdigest()[:12]}")
-    return _ENGINE[0]
-
-
-def file_digest(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def tree_digest(root: Path, stage: str) -> str:
-    """Of a stage under the stage root, with whatever it may refer to there: names, sizes and times of all files."""
-    digest = hashlib.sha256(stage.encode())
-    for folder, folders, names in os.walk(root):
-        folders.sort()
-        for name in sorted(names):
-            with contextlib.suppress(OSError):
-                seen = os.stat(os.path.join(folder, name))
-                digest.update(f"{folder}/{name}\0{seen.st_size}\0{seen.st_mtime_ns}\n".encode())
-    return digest.hexdigest()
-

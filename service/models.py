@@ -14,6 +14,7 @@ Aov = Literal[
     "weight.screen", "weight.ray", "weight.probe", "weight.sky", "weight.none", "confidence",
 ]  # fmt: skip
 Path = Annotated[str, StringConstraints(min_length=1, max_length=1024, pattern=r"^[^\x00-\x1f\x7f]+$")]
+_Once = Field(json_schema_extra={"uniqueItems": True})
 Unit = Annotated[float, Field(ge=0.0, le=1.0)]
 Length = Annotated[float, Field(gt=0.0, le=1e9, description="in the stage's own units")]
 
@@ -46,14 +47,14 @@ class Render(StageOnly):
     image_width: Annotated[int, Field(ge=1, le=1 << 28)] | None = None
     image_height: Annotated[int, Field(ge=0, le=1 << 28, description="0 follows the camera's aspect")] | None = None
     samples: Annotated[int, Field(ge=1, le=4096)] | None = None
-    tiers: Annotated[list[Tier], Field(min_length=1, max_length=4)] | None = None
+    tiers: Annotated[list[Tier], Field(min_length=1, max_length=4), _Once] | None = None
     screen: Literal["march", "proxy"] | None = None
     model: Model | None = None
     max_layers: Annotated[int, Field(ge=1, le=32)] | None = None
     exposure: Annotated[float, Field(ge=-64.0, le=64.0)] | None = None
-    purposes: Annotated[list[Purpose], Field(min_length=1, max_length=4)] | None = None
+    purposes: Annotated[list[Purpose], Field(min_length=1, max_length=4), _Once] | None = None
     time_code: Annotated[float, Field(ge=-1e9, le=1e9)] | None = None
-    aovs: Annotated[list[Aov], Field(max_length=17)] | None = None
+    aovs: Annotated[list[Aov], Field(max_length=17), _Once] | None = None
     color_correction: Literal["disabled", "sRGB", "openColorIO"] | None = None
     overrides: Annotated[dict[Path, Override], Field(max_length=256)] | None = None
 
@@ -80,6 +81,24 @@ class AovPicture(BaseModel):
     white: float = Field(description="value of a white pixel; black is 0")
 
 
+class FieldProblem(BaseModel):
+    pointer: str = Field(description="JSON pointer (RFC 6901) into the settings")
+    detail: str
+
+
+class ProblemDocument(BaseModel):
+    """RFC 9457. Its type is the address of a page about it."""
+
+    model_config = ConfigDict(title="Problem")
+    type: Annotated[str, StringConstraints(pattern="^/problems/[a-z-]+$")]
+    title: str
+    status: Annotated[int, Field(ge=400, le=599)]
+    detail: str
+    instance: str = Field("", description="the job")
+    errors: list[FieldProblem] = []
+    prim: str = Field("", description="path of the prim that is wrong")
+
+
 class Job(BaseModel):
     """What `GET /v1/jobs/{id}` answers."""
 
@@ -95,8 +114,34 @@ class Job(BaseModel):
     width: int | None
     height: int | None
     aovs: list[AovPicture]
-    problem: dict[str, Any] | None
+    problem: ProblemDocument | None
     links: dict[str, str]
+
+
+class StageFile(BaseModel):
+    path: str = Field(description="what a request calls it")
+    bytes: int
+
+
+class Stages(BaseModel):
+    stages: list[StageFile]
+
+
+class Limit(BaseModel):
+    name: str
+    value: int
+    default: int
+    unit: str
+    meaning: str
+    variable: str = Field(description="of the environment, which sets it")
+    flag: str = Field(description="of `refract serve`, which sets it")
+
+
+class LimitTable(BaseModel):
+    limits: list[Limit]
+    workers: int = Field(description="jobs at once")
+    queue: int = Field(description="jobs that may wait")
+    confinement: dict[str, Any] = Field(description="what confines workers on this machine")
 
 
 KINDS: dict[str, type[StageOnly]] = {"render": Render, "convert": Convert, "inspect": StageOnly, "validate": StageOnly}

@@ -24,16 +24,24 @@ def docs_page(document: dict[str, Any], limits: Limits) -> str:
     """Every operation, limit and problem type."""
     parts = [_HEAD.format(title="refract over HTTP"), '<p>As a document: <a href="/openapi.json">openapi.json</a>.</p>',
              "<pre>curl -F stage=@glass.usdz http://127.0.0.1:8000/v1/render -o glass.png</pre>"]  # fmt: skip
+    parts.append(f"<p>{escape(document['info']['description'])}</p>")
+    if "securitySchemes" in document["components"]:
+        parts.append("<p>This service asks for a token: send <code>Authorization: Bearer TOKEN</code>.</p>")
     for path, operations in document["paths"].items():
         for method, one in operations.items():
             parts.append(f"<h2><code>{method.upper()} {escape(path)}</code></h2>")
             parts.append(f"<p>{escape(one.get('description') or one.get('summary', ''))}</p>")
-            answers = ", ".join(f"{code} {escape(text['description'])}" for code, text in one["responses"].items())
-            parts.append(f"<p>Answers: {answers}</p>")
+            for header in one.get("parameters", ()):
+                if header["in"] == "header":
+                    parts.append(f"<p><code>{escape(header['name'])}</code>: {escape(header['description'])}</p>")
+            done = {code: text for code, text in one["responses"].items() if code < "4"}
+            answers = ", ".join(f"{code} {escape(text['description'])}" for code, text in done.items())
+            refusals = ", ".join(code for code in one["responses"] if code not in done)
+            parts.append(f"<p>Answers: {answers}; problems: {refusals}</p>")
             for media, content in one.get("requestBody", {}).get("content", {}).items():
                 schema = escape(json.dumps(content["schema"], indent=1))
                 parts.append(f"<details><summary>{escape(media)}</summary><pre>{schema}</pre></details>")
-    parts.append("<h2>Limits</h2><table><tr><th>name<th>value<th>unit<th>meaning<th>environment")
+    parts.append('<h2 id="limits">Limits</h2><table><tr><th>name<th>value<th>unit<th>meaning<th>environment')
     for row in table(limits):
         cells = (row["name"], row["value"], row["unit"], row["meaning"], row["variable"])
         parts.append("<tr>" + "".join(f"<td>{escape(str(cell))}" for cell in cells))

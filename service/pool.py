@@ -1,4 +1,4 @@
-"""Warm one-shot workers: the process that forks them, and what one of them is to the server."""
+"""Warm one-shot workers: what they are to the queue, and the process of this machine that forks them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from .worker import environment
 
@@ -18,22 +18,54 @@ _LINE = 1 << 20
 """Longest message of a worker [bytes]."""
 
 
-class Worker:
+class Worker(Protocol):
     """A process that waits for its one job."""
+
+    code: asyncio.Future[int]
+    """Exit code; negative is a signal."""
+    lost: bool
+    """It ended for no reason of its own."""
+
+    async def give(self, job: dict[str, Any]) -> None: ...
+
+    async def hear(self) -> dict[str, Any] | None:
+        """Next message; None when it has ended, or talks nonsense."""
+
+    def close(self) -> None: ...
+
+
+class Source(Protocol):
+    """Where workers come from."""
+
+    ready: asyncio.Event
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """What confines workers; empty until there is one."""
+
+    def start(self) -> None: ...
+
+    async def stop(self) -> None: ...
+
+    async def fork(self) -> Worker:
+        """A new warm worker; waits until there can be one."""
+
+    async def kill(self, worker: Worker) -> None: ...
+
+
+class Child:
+    """A worker on this machine."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, identifier: str) -> None:
         self.reader, self.writer, self.identifier = reader, writer, identifier
         self.code: asyncio.Future[int] = asyncio.get_running_loop().create_future()
-        """Exit code; negative is a signal."""
         self.lost = False
-        """It went down with the process that forked it."""
 
     async def give(self, job: dict[str, Any]) -> None:
         self.writer.write(json.dumps(job, allow_nan=False).encode() + b"\n")
         await self.writer.drain()
 
     async def hear(self) -> dict[str, Any] | None:
-        """Next message; None when it has ended, or talks nonsense."""
         try:
             line = await self.reader.readuntil(b"\n")
             message = json.loads(line)
@@ -50,10 +82,9 @@ class Nursery:
 
     def __init__(self) -> None:
         self.report: dict[str, Any] = {}
-        """What confines workers on this machine; empty until the first is warm."""
         self.ready = asyncio.Event()
         self.restarts = -1
-        self._workers: dict[str, Worker] = {}
+        self._workers: dict[str, Child] = {}
         self._control: socket.socket | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._task: asyncio.Task[None] | None = None
@@ -120,8 +151,7 @@ class Nursery:
                 worker.code.set_result(-9)
         self._workers.clear()
 
-    async def fork(self) -> Worker:
-        """A new warm worker; waits until there can be one."""
+    async def fork(self) -> Child:
         while True:
             await self.ready.wait()
             ours, theirs = socket.socketpair()
@@ -135,11 +165,12 @@ class Nursery:
                     await asyncio.sleep(0.1)
                     continue
             reader, writer = await asyncio.open_connection(sock=ours, limit=_LINE)
-            worker = Worker(reader, writer, identifier)
+            worker = Child(reader, writer, identifier)
             self._workers[identifier] = worker
             return worker
 
     async def kill(self, worker: Worker) -> None:
+        assert isinstance(worker, Child)
         if self._control and not worker.code.done():
             with contextlib.suppress(OSError):
                 await asyncio.get_running_loop().sock_sendall(

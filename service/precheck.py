@@ -16,11 +16,8 @@ from typing import NamedTuple
 from pxr import Ar, Sdf, Tf, UsdUtils
 
 from refract_core.usd.stage import captured
-from refract_core.usd.write import RECORD
 
 _LAYERS = (".usd", ".usda", ".usdc", ".usdz")
-_FLATTENED = "Stage of root layer "
-"""USD writes its path into what it flattens."""
 
 
 class Refused(Exception):
@@ -150,15 +147,3 @@ def _first_of(path: str) -> str:
             return package.namelist()[0]
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, IndexError):
         return ""
-
-
-def without_places(layer: Sdf.Layer) -> Sdf.Layer:
-    """A layer that is about to be written, without the paths of this machine that USD and the converter note in it."""
-    data = dict(layer.customLayerData)
-    record = data.get(RECORD)
-    if isinstance(record, dict) and "stage" in record:
-        layer.customLayerData = {**data, RECORD: {**record, "stage": os.path.basename(str(record["stage"]))}}
-    if _FLATTENED in layer.documentation:
-        kept = [line for line in layer.documentation.splitlines() if _FLATTENED not in line]
-        layer.documentation = "\n".join(kept).strip()
-    return layer

@@ -28,6 +28,7 @@ KINDS: dict[str, Kind] = {
     "not-done": Kind(409, "The job has no result", "Ask for the job itself: it tells its status."),
     "cancelled": Kind(409, "The job was cancelled", "Send the request again to start anew."),
     "too-large": Kind(413, "The body is too large", "See /v1/limits."),
+    "range-not-satisfiable": Kind(416, "The result does not reach that far", "Content-Range tells its size in bytes."),
     "unsupported-media-type": Kind(415, "The body is of a type that is not read", "Send JSON, or multipart with USD."),
     "invalid-settings": Kind(422, "The settings are not valid", "`errors` names each field by a JSON pointer."),
     "stage-invalid": Kind(422, "The stage cannot be read", "Try `refract validate` on it."),
@@ -37,14 +38,20 @@ KINDS: dict[str, Kind] = {
     "limit-exceeded": Kind(422, "The job is larger than this service allows", "See /v1/limits."),
     "time-limit": Kind(422, "The job took too long", "Ask for fewer pixels or samples, or a simpler stage."),
     "memory-limit": Kind(422, "The job needed too much memory", "Ask for fewer pixels, or a simpler stage."),
-    "stage-crashed": Kind(422, "The stage made its worker crash", "The stage is damaged; nothing else was affected."),
+    "stage-crashed": Kind(422, "The stage made its worker crash",
+                          "The stage is damaged, or it has found a fault of this program: whoever runs the service has "
+                          "the reason in its log, under the job's id. Nothing else was affected."),
     "queue-full": Kind(429, "Too many jobs are waiting", "Try again after the time in Retry-After."),
+    "head-too-large": Kind(431, "The head of the request is too large", "Send fewer or shorter headers."),
     "internal": Kind(500, "Something went wrong in the service", "Tell whoever runs it the request's id."),
+    "transfer-coding": Kind(501, "The transfer coding is not known", "Send Content-Length, or chunks."),
     "interrupted": Kind(503, "The service stopped before the job was done", "Send the request again."),
     "unavailable": Kind(503, "The service takes no jobs now", "Try again after the time in Retry-After."),
 }  # fmt: skip
 
-BY_STATUS = {404: "not-found", 405: "method-not-allowed", 413: "too-large", 415: "unsupported-media-type"}
+BY_STATUS = {404: "not-found", 405: "method-not-allowed", 413: "too-large", 415: "unsupported-media-type",
+             416: "range-not-satisfiable", 431: "head-too-large", 501: "transfer-coding"}  # fmt: skip
+"""The types of errors that a layer below tells by their status alone."""
 
 
 class Problem(Exception):
@@ -76,10 +83,18 @@ def respond(problem: Problem, instance: str = "") -> Response:
     return document_response(problem.document(instance), problem.headers)
 
 
+def of_status(status: int) -> Problem:
+    """The problem of an error that is known by its status alone."""
+    slug = BY_STATUS.get(status, "bad-request" if status < 500 else "internal")
+    return Problem(slug, KINDS[slug].about)
+
+
 def document_response(document: dict[str, Any], headers: dict[str, str] | None = None) -> Response:
     """A stored or new problem document as an answer."""
     content = json.dumps(document, allow_nan=False)
     extra = {"Cache-Control": "no-store", **(headers or {})}
     if document["status"] == 401:
         extra["WWW-Authenticate"] = "Bearer"
+    if document["status"] in (429, 503):
+        extra.setdefault("Retry-After", "5")
     return Response(content, document["status"], extra, MEDIA_TYPE)

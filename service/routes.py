@@ -13,46 +13,20 @@ from typing import Any
 from fastapi import APIRouter, Request, Response
 from starlette.responses import FileResponse, JSONResponse, StreamingResponse
 
-from . import models
+from . import models, openapi
 from .bodies import own_stage, read_wish, stages
-from .jobs import Jobs, file_digest, tree_digest
+from .digests import file_digest, tree_digest
+from .jobs import Jobs
 from .limits import table
-from .problems import MEDIA_TYPE, Problem, document_response
+from .openapi import problems
+from .problems import Problem, document_response
 from .store import RESULTS, Record
 
 router = APIRouter(prefix="/v1")
 _KEEP_ALIVE = 15.0  # [s] between comments in a quiet stream of events
 _TYPES = {".png": "image/png", ".exr": "image/x-exr", ".json": "application/json", ".usdz": "model/vnd.usdz+zip"}
-_PROBLEMS: dict[int | str, dict[str, Any]] = {
-    "4XX": {"description": "a problem document", "content": {MEDIA_TYPE: {}}},
-    "5XX": {"description": "a problem document", "content": {MEDIA_TYPE: {}}},
-}
-_ACCEPTED: dict[str, Any] = {"description": "with `Prefer: respond-async`: the job; Location is its address"}
-
-
-def _body(model: type[models.StageOnly]) -> dict[str, Any]:
-    form = {
-        "type": "object", "required": ["stage"], "additionalProperties": False,
-        "properties": {"stage": {"type": "string", "format": "binary"},
-                       "settings": {"type": "string", "contentMediaType": "application/json"}},
-    }  # fmt: skip
-    content = {"application/json": {"schema": _inlined(model)}, "multipart/form-data": {"schema": form}}
-    return {"requestBody": {"required": True, "content": content}}
-
-
-def _inlined(model: type[models.StageOnly]) -> dict[str, Any]:
-    """The schema with its definitions in place, for a document that has no room of ours for them."""
-    schema = model.model_json_schema()
-    known = schema.pop("$defs", {})
-
-    def put(value: Any) -> Any:
-        if isinstance(value, dict):
-            if "$ref" in value:
-                return put(known[value["$ref"].rpartition("/")[2]])
-            return {key: put(inner) for key, inner in value.items()}
-        return [put(inner) for inner in value] if isinstance(value, list) else value
-
-    return {**put(schema), "required": ["stage"]}
+_OBJECT: dict[str, Any] = {"type": "object"}
+_CONVERTED = {"type": "object", "required": ["stage", "out", "materials", "notices"]}
 
 
 def _jobs(request: Request) -> Jobs:
@@ -63,35 +37,35 @@ def _jobs(request: Request) -> Jobs:
 # --- work -------------------------------------------------------------------------------------------------------------
 
 
-@router.post("/render", openapi_extra=_body(models.Render), responses={
-    200: {"description": "the picture", "content": {"image/png": {}, "image/x-exr": {}}}, 202: _ACCEPTED, **_PROBLEMS,
-}, response_class=Response)  # fmt: skip
+@router.post("/render", response_class=Response, **openapi.work(
+    models.Render, "the picture", {"image/png": {}, "image/x-exr": {}}
+))  # fmt: skip
 async def render(request: Request) -> Response:
     """Render a stage. Answers with the picture; `Accept` chooses image/png or image/x-exr."""
     media = _chosen(request, ("image/png", "image/x-exr"))
     return await _work(request, "render", {"format": "exr" if media == "image/x-exr" else "png"}, media)
 
 
-@router.post("/convert", openapi_extra=_body(models.Convert), responses={
-    200: {"description": "the converted stage, or what was done",
-          "content": {"model/vnd.usdz+zip": {}, "application/json": {}}}, 202: _ACCEPTED, **_PROBLEMS,
-}, response_class=Response)  # fmt: skip
+@router.post("/convert", response_class=Response, **openapi.work(
+    models.Convert, "the converted stage, or what was done",
+    {"model/vnd.usdz+zip": {}, "application/json": {"schema": _CONVERTED}},
+))  # fmt: skip
 async def convert(request: Request) -> Response:
     """Find the glass of a stage and describe it with RefractMaterialAPI, as `refract convert`."""
     return await _work(request, "convert", {}, _chosen(request, ("model/vnd.usdz+zip", "application/json")))
 
 
-@router.post("/inspect", openapi_extra=_body(models.StageOnly), responses={
-    200: {"description": "the report", "content": {"application/json": {}}}, 202: _ACCEPTED, **_PROBLEMS,
-}, response_class=Response)  # fmt: skip
+@router.post("/inspect", response_class=Response, **openapi.work(
+    models.StageOnly, "the report", {"application/json": {"schema": _OBJECT}}
+))  # fmt: skip
 async def inspect(request: Request) -> Response:
     """What is in a stage, as `refract inspect --json`."""
     return await _work(request, "inspect", {}, _chosen(request, ("application/json",)))
 
 
-@router.post("/validate", openapi_extra=_body(models.StageOnly), responses={
-    200: {"description": "the verdict", "content": {"application/json": {}}}, 202: _ACCEPTED, **_PROBLEMS,
-}, response_class=Response)  # fmt: skip
+@router.post("/validate", response_class=Response, **openapi.work(
+    models.StageOnly, "the verdict", {"application/json": {"schema": _OBJECT}}
+))  # fmt: skip
 async def validate(request: Request) -> Response:
     """What is wrong with a stage, as `refract validate --json`."""
     return await _work(request, "validate", {}, _chosen(request, ("application/json",)))
@@ -196,13 +170,13 @@ def _known(request: Request, identifier: str) -> Record:
     return record
 
 
-@router.get("/jobs/{identifier}", response_model=models.Job, responses=_PROBLEMS)
+@router.get("/jobs/{identifier}", response_model=models.Job, responses=problems(404))
 async def job(request: Request, identifier: str) -> Response:
     """How a job is doing."""
     return JSONResponse(_known(request, identifier).document(), headers={"Cache-Control": "no-store"})
 
 
-@router.delete("/jobs/{identifier}", response_model=models.Job, responses=_PROBLEMS)
+@router.delete("/jobs/{identifier}", response_model=models.Job, responses=problems(403, 404))
 async def cancel(request: Request, identifier: str) -> Response:
     """Cancel a job: its process is killed. A job that has ended stays as it is."""
     record = _known(request, identifier)
@@ -211,7 +185,7 @@ async def cancel(request: Request, identifier: str) -> Response:
 
 
 @router.get("/jobs/{identifier}/events", response_class=StreamingResponse, responses={
-    200: {"description": "server-sent events", "content": {"text/event-stream": {}}}, **_PROBLEMS,
+    200: {"description": "server-sent events", "content": {"text/event-stream": {}}}, **problems(404, 429),
 })  # fmt: skip
 async def events(request: Request, identifier: str) -> StreamingResponse:
     """Progress as server-sent events: `progress`, then one of `done`, `failed`, `cancelled`; data is the job."""
@@ -263,11 +237,8 @@ def _result(request: Request, jobs: Jobs, record: Record, name: str) -> Response
     return FileResponse(path, headers=headers, media_type=_TYPES[path.suffix])
 
 
-_FILES: dict[int | str, dict[str, Any]] = {200: {"description": "the file"}, 304: {"description": "unchanged"},
-                                           **_PROBLEMS}  # fmt: skip
-
-
-@router.get("/jobs/{identifier}/image", response_class=Response, responses=_FILES)
+@router.get("/jobs/{identifier}/image", response_class=Response,
+            **openapi.result("the picture", "image/png", "image/x-exr"))  # fmt: skip
 async def image(request: Request, identifier: str) -> Response:
     """The picture of a render."""
     record = _known(request, identifier)
@@ -276,19 +247,19 @@ async def image(request: Request, identifier: str) -> Response:
     return _result(request, _jobs(request), record, _file_of(record))
 
 
-@router.get("/jobs/{identifier}/aovs/{name}.png", response_class=Response, responses=_FILES)
+@router.get("/jobs/{identifier}/aovs/{name}.png", response_class=Response, **openapi.result("the picture", "image/png"))
 async def aov(request: Request, identifier: str, name: str) -> Response:
     """One AOV of a render that asked for it, as 8-bit grey or colour; the job says what white is."""
     return _result(request, _jobs(request), _known(request, identifier), f"aov.{name}.png")
 
 
-@router.get("/jobs/{identifier}/file", response_class=Response, responses=_FILES)
+@router.get("/jobs/{identifier}/file", response_class=Response, **openapi.result("the stage", "model/vnd.usdz+zip"))
 async def converted(request: Request, identifier: str) -> Response:
     """The stage that a conversion made."""
     return _result(request, _jobs(request), _known(request, identifier), "converted.usdz")
 
 
-@router.get("/jobs/{identifier}/report", response_class=Response, responses=_FILES)
+@router.get("/jobs/{identifier}/report", response_class=Response, **openapi.result("the report", "application/json"))
 async def report(request: Request, identifier: str) -> Response:
     """What a conversion, inspection or validation found."""
     return _result(request, _jobs(request), _known(request, identifier), "report.json")
@@ -297,17 +268,17 @@ async def report(request: Request, identifier: str) -> Response:
 # --- about the service ------------------------------------------------------------------------------------------------
 
 
-@router.get("/stages", responses=_PROBLEMS)
+@router.get("/stages", response_model=models.Stages)
 async def own_stages(request: Request) -> dict[str, list[dict[str, Any]]]:
     """Stages that a request may name."""
     return {"stages": await asyncio.to_thread(stages, _jobs(request).stage_root)}
 
 
-@router.get("/limits", responses=_PROBLEMS)
+@router.get("/limits", response_model=models.LimitTable)
 async def show_limits(request: Request) -> dict[str, Any]:
     """Every limit, and what confines workers on this machine."""
     jobs = _jobs(request)
     return {
         "limits": table(jobs.limits), "workers": jobs.workers, "queue": jobs.places - jobs.workers,
-        "confinement": jobs.nursery.report,
+        "confinement": jobs.source.report,
     }  # fmt: skip

@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import socket
+import sys
+from http import HTTPStatus
 from types import FrameType
 from typing import Any
 
+import h11
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from refract_core.errors import UsageError
 
 from .app import Settings, create_app
+from .edge import GUARDS
+from .problems import Problem, of_status, respond
+
+_LINGER = 1.0
+"""[s] What a client still sends after an error is read and thrown away for this long: if the connection closed at
+once, its system would drop the answer."""
 
 
 def serve(settings: Settings, host: str, port: int) -> None:
@@ -50,18 +60,46 @@ class _Server(uvicorn.Server):
 
 
 def _patient(seconds: float) -> type[H11Protocol]:
-    """uvicorn's own protocol, which ends a connection that does not get to the end of a head in time."""
+    """uvicorn's own protocol, which ends a connection that does not get to the end of a head in time, and answers what
+    is not HTTP with a problem document too."""
 
     class Patient(H11Protocol):
         _giving_up: asyncio.TimerHandle | None = None
+        _refused = False
 
         def connection_made(self, transport: Any) -> None:
             super().connection_made(transport)
             self._watch()
 
         def data_received(self, data: bytes) -> None:
-            super().data_received(data)
-            self._watch()
+            if not self._refused:
+                super().data_received(data)
+                self._watch()
+
+        def send_400_response(self, msg: str) -> None:
+            """uvicorn calls this where h11 cannot read on: in a head, or in the chunks of a body."""
+            self._refused = True
+            status = getattr(sys.exception(), "error_status_hint", 400)
+            answer = respond(of_status(status) if status != 400 else Problem("bad-request", "this is no HTTP/1.1"))
+            begun = self.conn.our_state not in (h11.IDLE, h11.SEND_RESPONSE)
+            if self.cycle is not None and not self.cycle.response_complete:  # its body ends here
+                self.cycle.disconnected = True
+                self.cycle.message_event.set()
+            if begun:
+                self.transport.close()
+                return
+            headers = [*answer.raw_headers, *GUARDS, (b"connection", b"close")]
+            reason = HTTPStatus(answer.status_code).phrase.encode()
+            with contextlib.suppress(h11.LocalProtocolError):  # the answer to a HEAD has no body
+                self._write(h11.Response(status_code=answer.status_code, headers=headers, reason=reason))
+                self._write(h11.Data(data=bytes(answer.body)))
+                self._write(h11.EndOfMessage())
+            if self.transport.can_write_eof():
+                self.transport.write_eof()
+            self.loop.call_later(_LINGER, self.transport.close)
+
+        def _write(self, event: h11.Event) -> None:
+            self.transport.write(self.conn.send(event) or b"")
 
         def _watch(self) -> None:
             busy = self.cycle is not None and not self.cycle.response_complete

@@ -65,6 +65,14 @@ class Record:
         }  # fmt: skip
 
 
+def make_work(parent: Path) -> Path:
+    """A worker's folder: what comes in, what goes out, and scratch."""
+    folder = parent / secrets.token_hex(8)
+    for part in ("in", "out", "tmp"):
+        (folder / part).mkdir(parents=True, mode=0o700)
+    return folder
+
+
 class Store:
     """The folder of all jobs."""
 
@@ -129,10 +137,7 @@ class Store:
     # --- a worker's folder ------------------------------------------------------------------------------------------
 
     def new_work(self) -> Path:
-        folder = self.work / secrets.token_hex(8)
-        for part in ("in", "out", "tmp"):
-            (folder / part).mkdir(parents=True, mode=0o700)
-        return folder
+        return make_work(self.work)
 
     def take_results(self, work: Path, record: Record) -> None:
         """Move what a worker wrote into the job's folder: plain files of known names, nothing else."""

@@ -178,7 +178,7 @@ def _perform(job: dict[str, Any], say: Any) -> Any:
     means = confine.Means(
         limits["memory_bytes"], limits["cpu_seconds"], limits["result_bytes"], limits["open_files"]
     )
-    confine.confine([*_own_files(), root], [out, scratch], means)
+    confine.confine([*own_files(), root], [out, scratch], means)
     if job.get("forbidden"):  # for tests: prove that the lock holds
         return _try_to_escape(job["forbidden"])
     try:
@@ -190,7 +190,7 @@ def _perform(job: dict[str, Any], say: Any) -> Any:
     return tasks.perform(job["kind"], job["stage"], out, job["settings"], limits, say)
 
 
-def _own_files() -> list[str]:
+def own_files() -> list[str]:
     """What the program itself is made of, and nothing else of the machine."""
     from refract_core.kernel import cache_root
 

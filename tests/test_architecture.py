@@ -25,7 +25,7 @@ ROOMS = {
     "OpenImageIO": ("refract_core.image", "refract_core.image_files", "refract_core.image_cubemaps"),
     "pygltflib": ("refract_core.gltf",),
     "flip_evaluator": ("refract_core.compare",),
-    "distributed": ("refract_core.executors",),
+    "distributed": ("refract_core.executors", "service.cluster", "service.cluster_worker"),
     "dask": ("refract_core.executors",),
     "fastapi": ("service",),
     "starlette": ("service",),

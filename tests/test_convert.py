@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -154,6 +155,26 @@ def test_flatten_needs_nothing_below_it(tmp_path: Path) -> None:
     Path(path).unlink()
     assert not Sdf.Layer.FindOrOpen(str(out)).subLayerPaths
     assert material(load_stage(out), "Ball").model is Model.SPHERE
+
+
+@pytest.mark.parametrize("flatten", [False, True])
+def test_a_package_names_no_folder_of_the_machine_that_made_it(tmp_path: Path, flatten: bool) -> None:
+    source, out = tmp_path / "here", tmp_path / "there" / "out.usdz"
+    for folder in (source / "tiles", out.parent):
+        folder.mkdir(parents=True)
+    for number in (1001, 1002):
+        (source / "tiles" / f"a.{number}.png").write_bytes(b"tile")
+    files = ("./tiles/a.<UDIM>.png", "./lost/b.png", "lost/c.png", "./lost/d.<UDIM>.png", "./tiles")
+    lines = tuple(f"asset inputs:file{number} = @{file}@" for number, file in enumerate(files))
+    path = stage(source, [glass("Glass", lines=lines)], [ball("A", "Glass", 1.0)])
+    run(path, out, flatten=flatten)
+    opened = Usd.Stage.Open(str(out))
+    text = "".join(layer.ExportToString() for layer in opened.GetUsedLayers())
+    assert str(tmp_path) not in text.replace(str(out), "")
+    assert "root layer" not in text
+    assert opened.GetRootLayer().customLayerData["refract"] == {"made": "convert", "stage": "in.usda"}
+    with zipfile.ZipFile(out) as package:
+        assert sum(name.endswith((".1001.png", ".1002.png")) for name in package.namelist()) == 2
 
 
 def test_the_input_is_never_written(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -18,6 +19,7 @@ from service_server import BALL, ROOT, SMALL, Server, running, until, upload
 from refract_core.image import read_texture
 
 GOOD = ROOT / "usd_samples" / "good"
+JSON = b"POST /v1/render HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
 SLOW = {"stage": "marble.usda", "image_width": 640, "samples": 16}
 """Seconds of work, to have time to do something meanwhile."""
 
@@ -192,6 +194,7 @@ def test_the_kill_of_a_worker_fails_one_job(client: httpx.Client, server: Server
         os.kill(pid, signal.SIGKILL)
     until(lambda: client.get(where).json()["status"] == "failed")
     assert client.get(where).json()["problem"]["type"] == "/problems/stage-crashed"
+    assert where.rpartition("/")[2] in server.log.read_text()
     assert post(client).status_code == 200
 
 
@@ -201,6 +204,71 @@ def test_the_death_of_all_workers_is_survived(client: httpx.Client, server: Serv
     if first.status_code != 200:  # it had begun
         assert (first.status_code, first.json()["type"]) == (503, "/problems/interrupted")
     assert post(client, exposure=-1.0).status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("sent", "status"),
+    [
+        (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03 no HTTP\r\n\r\n", 400),
+        (b"GET /livez HTTP/1.1\r\n\r\n", 400),
+        (b"GET /livez HTTP/1.1\r\nHost: x\r\nno colon\r\n\r\n", 400),
+        (b"GET /livez HTTP/1.1\r\nHost: x\r\nX: " + b"a" * 500_000 + b"\r\n\r\n", 431),
+        (b"GET /" + b"a" * 500_000 + b" HTTP/1.1\r\nHost: x\r\n\r\n", 431),
+        (JSON + b"Content-Length: -5\r\n\r\n", 400),
+        (JSON + b"Transfer-Encoding: gzip\r\n\r\n", 501),
+        (JSON + b"Transfer-Encoding: chunked\r\n\r\nZZ\r\nabc\r\n", 400),
+        (JSON + b'Transfer-Encoding: chunked\r\n\r\n2\r\n{"\r\nZZ\r\nabc\r\n', 400),
+    ],
+)
+def test_what_is_no_http_is_a_problem_document_too(server: Server, sent: bytes, status: int) -> None:
+    with server.connect() as connection:
+        with contextlib.suppress(ConnectionError):  # it need not listen to the end
+            connection.sendall(sent)
+        answer = b"".join(iter(lambda: connection.recv(65536), b""))
+    head, _, body = answer.partition(b"\r\n\r\n")
+    assert head.startswith(b"HTTP/1.1 %d " % status)
+    assert b"content-type: application/problem+json" in head.lower()
+    assert json.loads(body)["status"] == status
+    assert "Traceback" not in server.log.read_text()
+
+
+def test_head_is_get_without_the_body(client: httpx.Client) -> None:
+    picture = post(client, aovs=["Z"]).headers["content-location"]
+    package = post(client, "convert").headers["content-location"]
+    results = [f"{picture}/image", f"{picture}/aovs/Z.png", f"{package}/file", f"{package}/report"]
+    others = ["/", "/livez", "/readyz", "/v1/limits", "/v1/stages", picture, f"{picture}/events", "/docs", "/nothing",
+              "/openapi.json", "/static/page.js"]  # fmt: skip
+    own = {"date", "x-request-id"}
+    for path in (*results, *others):
+        get, head = client.get(path), client.head(path)
+        assert (head.status_code, head.content) == (get.status_code, b"")
+        assert {**head.headers, **dict.fromkeys(own)} == {**get.headers, **dict.fromkeys(own)}, path
+    for path in results:
+        tag = client.head(path).headers["etag"]
+        for method in ("GET", "HEAD"):
+            unchanged = client.request(method, path, headers={"If-None-Match": tag})
+            assert (unchanged.status_code, unchanged.content, unchanged.headers["etag"]) == (304, b"", tag)
+
+
+def test_a_part_of_a_result_can_be_asked_for(client: httpx.Client) -> None:
+    where = post(client).headers["content-location"] + "/image"
+    whole = client.get(where)
+    tag, size = whole.headers["etag"], len(whole.content)
+
+    def ask(span: str, **headers: str) -> tuple[int, bytes, str]:
+        answer = client.get(where, headers={"Range": span, **{k.replace("_", "-"): v for k, v in headers.items()}})
+        return answer.status_code, answer.content, answer.headers.get("content-range", "")
+
+    assert ask("bytes=2-9") == (206, whole.content[2:10], f"bytes 2-9/{size}")
+    assert ask("bytes=-7") == (206, whole.content[-7:], f"bytes {size - 7}-{size - 1}/{size}")
+    assert ask("bytes=2-9", If_Range=tag)[0] == 206
+    beyond = client.get(where, headers={"Range": f"bytes={size}-"})
+    assert (beyond.status_code, beyond.headers["content-range"]) == (416, f"bytes */{size}")
+    assert beyond.json()["type"] == "/problems/range-not-satisfiable"
+    for ignored in ("bytes=9-2", "lines=1-2", "bytes=x", "bytes=-", "bytes=0-1,4-5"):
+        assert ask(ignored) == (200, whole.content, "")
+    assert ask("bytes=2-9", If_Range='"other"') == (200, whole.content, "")
+    assert ask(f"bytes={size}-", If_Range=f"W/{tag}") == (200, whole.content, "")
 
 
 def test_livez_readyz_limits_stages(client: httpx.Client) -> None:
@@ -219,3 +287,10 @@ def test_an_idle_service_leaves_nothing_behind(client: httpx.Client, server: Ser
     until(lambda: len(list((server.data / "work").iterdir())) == 1)  # of the next worker
     until(lambda: len(server.workers()) == 1)
     assert [path for path in server.data.rglob("stage.usd*")] == []
+
+
+def test_a_browser_asks_anew_for_the_pages_files(client: httpx.Client) -> None:
+    first = client.get("/static/page.js")
+    assert first.headers["cache-control"] == "no-cache"
+    again = client.get("/static/page.js", headers={"If-None-Match": first.headers["etag"]})
+    assert (again.status_code, again.headers["cache-control"]) == (304, "no-cache")

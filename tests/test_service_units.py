@@ -21,7 +21,7 @@ from refract_core.settings import MODELS, PURPOSES, SCREEN_METHODS, TIERS, Rende
 from service import confine, models, precheck, problems
 from service.app import Settings, create_app
 from service.bodies import check, parse
-from service.jobs import engine
+from service.digests import engine
 from service.limits import Limits, limits_from, table
 from service.problems import KINDS, Problem
 from service.store import Record, Store
@@ -266,6 +266,52 @@ def test_the_openapi_document_names_every_route(client: InProcess) -> None:
     form = paths["/v1/render"]["post"]["requestBody"]["content"]
     assert form["application/json"]["schema"]["additionalProperties"] is False
     assert "samples" in form["application/json"]["schema"]["properties"]
+
+
+@pytest.mark.parametrize("tokens", [(), ("a-token-of-the-tests",)])
+def test_the_openapi_document_tells_where_a_token_is_asked_for(tmp_path: Path, tokens: tuple[str, ...]) -> None:
+    client = InProcess(create_app(Settings(data=str(tmp_path / "data"), tokens=tokens)))
+    document = client.get("/openapi.json").json()  # open to all, as are the pages
+    schemes = document["components"].get("securitySchemes", {})
+    assert schemes == ({"token": {"type": "http", "scheme": "bearer"}} if tokens else {})
+    for path, operations in document["paths"].items():
+        asks = bool(tokens) and path.startswith(("/v1/", "/metrics"))
+        for operation in operations.values():
+            assert operation.get("security", []) == ([{"token": []}] if asks else [])
+            assert ("401" in operation["responses"]) == asks
+    assert client.get("/").status_code == client.get("/static/page.js").status_code == 200
+    assert client.get("/v1/stages").status_code == (401 if tokens else 200)
+    if tokens:
+        assert client.get("/v1/limits").headers["www-authenticate"] == "Bearer"
+    limits = client.get("/docs").text.partition('id="limits"')[2]  # where the page's link leads, with tokens or not
+    assert all(str(row["name"]) in limits for row in table(Limits()))
+    assert 'href="docs#limits"' in client.get("/").text
+
+
+def test_the_openapi_document_tells_what_is_refused(client: InProcess) -> None:
+    document = client.get("/openapi.json").json()
+    for verb in ("render", "convert", "inspect", "validate"):
+        body = document["paths"][f"/v1/{verb}"]["post"]["requestBody"]["content"]
+        named = body["application/json"]["schema"]
+        assert named["required"] == ["stage"]
+        assert named["properties"]["stage"]["type"] == "string"
+        uploaded = body["multipart/form-data"]["schema"]["properties"]["settings"]["contentSchema"]
+        assert uploaded["properties"].keys() == named["properties"].keys() - {"stage"}
+    operations = [one for path in document["paths"].values() for one in path.values()]
+    every = [answer for one in operations for answer in one["responses"].items()]
+    for status, answer in every:
+        assert ("application/problem+json" in answer.get("content", {})) == (status >= "400")
+    statuses = {int(status) for status, _ in every}
+    # No tokens here; and a method that is not allowed is no operation.
+    assert {kind.status for kind in KINDS.values()} - statuses == {401, 405}
+
+
+@pytest.mark.parametrize(("path", "methods"), [("/v1/render", "POST"), ("/v1/jobs/x", "DELETE, GET, HEAD"),
+                                               ("/livez", "GET, HEAD"), ("/static/page.js", "GET, HEAD"),
+                                               ("/openapi.json", "GET, HEAD")])  # fmt: skip
+def test_a_wrong_method_is_told_the_right_ones(client: InProcess, path: str, methods: str) -> None:
+    answer = client.request("PUT", path)
+    assert (answer.status_code, answer.headers["allow"]) == (405, methods)
 
 
 def test_settings_are_checked() -> None:

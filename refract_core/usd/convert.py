@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdUtils
 
 from ..scene import Notice
-from .layers import words_of
+from .layers import outer_of, words_of
 from .materials import API
 from .stage import open_stage, stage_unit, time_range
 from .write import RECORD, overlay
@@ -59,17 +59,23 @@ def begin(path: str, *, flatten: bool) -> Work:
     if flatten:
         layer, lost = _flat(stage)
         notices += [Notice(path, f"USD says: {text}") for text in lost]
-        layer.customLayerData = {**layer.customLayerData, RECORD: {"made": MADE, "stage": os.path.abspath(path)}}
         stage = Usd.Stage.Open(layer)
     else:
         layer = overlay(path, made=MADE)
+    layer.customLayerData = {**layer.customLayerData, RECORD: origin(path)}
     return Work(stage, layer, Usd.TimeCode(time_range(stage)[0]), stage_unit(stage, notices), tuple(notices))
+
+
+def origin(path: str) -> dict[str, str]:
+    """What a converted layer tells of where it comes from: no folder, as it may travel far from its stage."""
+    outer = outer_of(path)
+    return {"made": MADE, "stage": os.path.basename(outer) + path[len(outer) :]}
 
 
 def _flat(stage: Usd.Stage) -> tuple[Sdf.Layer, list[str]]:
     """One layer with everything, and what USD says about that."""
     delegate = UsdUtils.CoalescingDiagnosticDelegate()
-    layer = stage.Flatten()
+    layer = stage.Flatten(addSourceFileComment=False)  # it would name folders of this machine
     said = [words_of(one) for one in delegate.TakeUncoalescedDiagnostics()]
     return layer, list(dict.fromkeys(said))
 

@@ -13,7 +13,7 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
 from ..errors import StageError
 from ..gltf import Gltf, GltfMaterial, Picture, Primitive, read_gltf
 from ..scene import F64
-from .convert import MADE, Work
+from .convert import Work, origin
 from .convert_find import Glass
 from .surfaces import Surface
 from .write import RECORD
@@ -48,7 +48,7 @@ def _build(path: str, gltf: Gltf, pictures: str) -> tuple[Work, list[Glass], dic
     stage = Usd.Stage.Open(layer)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    layer.customLayerData = {RECORD: {"made": MADE, "stage": os.path.abspath(path)}}
+    layer.customLayerData = {RECORD: origin(path)}
     stem = os.path.splitext(os.path.basename(path))[0]
     root = UsdGeom.Xform.Define(stage, f"/{Tf.MakeValidIdentifier(stem)}")
     stage.SetDefaultPrim(root.GetPrim())

@@ -7,6 +7,7 @@ packed here in the tree in which they lie on disk: relative paths, and expressio
 from __future__ import annotations
 
 import errno
+import glob
 import os
 import shutil
 import struct
@@ -93,6 +94,8 @@ def _files_of(asset: str) -> set[str]:
     """Absolute paths of a file and of everything it refers to, as far as they exist."""
     if is_expression(asset) or not os.path.isabs(outer_of(asset)):
         return set()
+    if "<UDIM>" in asset:
+        return {os.path.abspath(tile) for tile in tiles(asset)}
     paths = [asset]
     if outer_of(asset).lower().endswith((*_LAYERS, ".usdz")) and os.path.isfile(outer_of(asset)):
         with quiet():
@@ -104,6 +107,11 @@ def _files_of(asset: str) -> set[str]:
         paths += [*(layer.realPath for layer in layers), *assets]
     files = {os.path.abspath(outer_of(path)) for path in paths if path}
     return {file for file in files if os.path.isfile(file)}
+
+
+def tiles(asset: str) -> list[str]:
+    """The files of a texture in tiles, whose name says <UDIM> for a number of four digits."""
+    return glob.glob(glob.escape(asset).replace("<UDIM>", "[0-9]" * 4)) if "<UDIM>" in asset else []
 
 
 def _check_variables(missing: list[str]) -> None:

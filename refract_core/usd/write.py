@@ -11,7 +11,7 @@ from pxr import Sdf, Tf, UsdUtils
 from ..errors import StageError, UsageError
 from ..files import check_place, replacing
 from .layers import copy_of, edit_asset_paths, export, is_expression, outer_of, quiet
-from .package import pack
+from .package import pack, tiles
 
 EXTENSIONS = (".usd", ".usda", ".usdc", ".usdz")
 RECORD = "refract"
@@ -140,7 +140,8 @@ def save(layer: Sdf.Layer, out: str) -> None:
 
     .usda is text, .usdc and .usd are crate. Absolute asset paths become relative to OUT where both lie in one tree;
     relative ones are relative to OUT already. A .usdz holds everything the layer refers to: itself first, and what it
-    takes from other packages as plain files beside it.
+    takes from other packages as plain files beside it. What it names but is not there keeps its name alone: a package
+    tells nobody how the folders lie that it was made in.
 
     Args:
         layer: as `overlay` gives it, with opinions added.
@@ -154,7 +155,7 @@ def save(layer: Sdf.Layer, out: str) -> None:
     with replacing(out, StageError) as temporary:
         if out.lower().endswith(".usdz"):
             folder = os.path.dirname(os.path.abspath(out))
-            edit_asset_paths(written, lambda asset: _joined(folder, asset))
+            edit_asset_paths(written, lambda asset: _found(_joined(folder, asset)))
             pack(written, temporary, out)
         else:
             edit_asset_paths(written, lambda asset: _relative(asset, out))
@@ -166,6 +167,14 @@ def _joined(folder: str, asset: str) -> str:
     if not asset or is_expression(asset) or "://" in asset or os.path.isabs(outer):
         return asset
     return os.path.normpath(os.path.join(folder, outer)) + asset[len(outer) :]
+
+
+def _found(asset: str) -> str:
+    """A path that leads nowhere, without its folder."""
+    outer = outer_of(asset)
+    if is_expression(asset) or not os.path.isabs(outer) or os.path.isfile(outer) or tiles(outer):
+        return asset
+    return f"./{os.path.basename(outer)}" + asset[len(outer) :]
 
 
 def _record_relative(layer: Sdf.Layer, out: str) -> None:

@@ -1,0 +1,299 @@
+"""Workers on a Dask cluster, where `pool.Nursery` has them on this machine. The service says what, Dask says where.
+
+A job travels with its stage: by path where a worker finds the same files under the same stage root, else the files
+themselves, once for all jobs that need them. What it makes comes back with its result. See `cluster_worker`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import logging
+import secrets
+import warnings
+from collections import OrderedDict
+from concurrent.futures import CancelledError
+from pathlib import Path
+from typing import Any
+
+from refract_core.errors import RefractError
+from refract_core.executors import CONNECT_SECONDS, nobody_at, scheduler_of, silent
+
+from . import cluster_worker
+from .cluster_worker import Ended, Order
+from .digests import engine
+from .gather import files_of
+from .pool import Worker
+from .problems import Problem
+from .store import RESULTS
+
+log = logging.getLogger("refract.service")
+_AGAIN = 5.0  # [s] between attempts to reach the scheduler
+_LOOK = 0.5  # [s] between looks at who has joined
+_KEPT = 4
+"""Stages kept on the cluster for jobs to come."""
+_KNOWN_STAGES = 64
+
+
+class Remote:
+    """A job's way to the cluster and back."""
+
+    def __init__(self, cluster: Cluster, client: Any) -> None:
+        self.cluster, self.client, self.token = cluster, client, secrets.token_hex(8)
+        self.code: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+        self.lost = False
+        self.future: Any = None
+        self.messages: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
+        self._way: asyncio.Task[None] | None = None
+
+    async def give(self, job: dict[str, Any]) -> None:
+        if self.client.status != "running":
+            raise ConnectionError("the scheduler is gone")
+        self._way = asyncio.create_task(self._go(job))
+
+    async def hear(self) -> dict[str, Any] | None:
+        return await self.messages.get()
+
+    def close(self) -> None:
+        self.cluster.forget(self)
+        if self._way:
+            self._way.cancel()
+
+    async def _go(self, job: dict[str, Any]) -> None:
+        """Send a job, wait for its end, and leave all as a worker of this machine would leave it."""
+        last: dict[str, Any] | None = None
+        code = -9
+        try:
+            ended = await self.cluster.send(self, job)
+            last, code = ended.message, ended.code
+            await asyncio.to_thread(_leave, ended, Path(job["folder"]))
+        except Problem as problem:
+            last = {"problem": {"slug": problem.slug, "detail": problem.detail}}
+        except CancelledError:  # by us, or with the scheduler
+            self.lost = True
+        except Exception as error:
+            last = _trouble(error)
+        finally:
+            for message in ({"began": True}, last):  # the first may have been lost on its way
+                self.messages.put_nowait(message)
+            if not self.code.done():
+                self.code.set_result(code)
+
+
+class Cluster:
+    """A Dask cluster, found again when it was lost."""
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+        self.ready = asyncio.Event()
+        self._reports: dict[str, dict[str, Any]] = {}
+        """By address of the Dask worker."""
+        self._topic = f"refract-{secrets.token_hex(8)}"
+        self._remotes: dict[str, Remote] = {}
+        self._content: OrderedDict[str, Any] = OrderedDict()
+        self._known: OrderedDict[tuple[str, str, str], tuple[str, ...]] = OrderedDict()
+        self._client: Any = None
+        self._task: asyncio.Task[None] | None = None
+        self._over = False
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """The weakest of all machines."""
+        reports = list(self._reports.values())
+        weakest = {name: min(one.get(name, 0) for one in reports) for name in (reports[0] if reports else ())}
+        return {"executor": self.address, "cluster_workers": len(reports), **weakest}
+
+    def start(self) -> None:
+        self._task = asyncio.create_task(self._keep())
+
+    async def stop(self) -> None:
+        self._over = True
+        if self._task:
+            self._task.cancel()
+            await asyncio.gather(self._task, return_exceptions=True)
+
+    async def fork(self) -> Remote:
+        await self.ready.wait()
+        remote = Remote(self, self._client)
+        self._remotes[remote.token] = remote
+        return remote
+
+    async def kill(self, worker: Worker) -> None:
+        assert isinstance(worker, Remote)
+        if worker.future is not None and not worker.code.done():
+            with contextlib.suppress(OSError):
+                await worker.future.cancel(force=True)
+
+    def forget(self, remote: Remote) -> None:
+        self._remotes.pop(remote.token, None)
+
+    # --- the connection
+
+    async def _keep(self) -> None:
+        said = ""
+        while not self._over:
+            try:
+                with silent("distributed.client"):
+                    await self._meet()
+                trouble = f"--executor {self.address}: the scheduler has gone away"
+            except OSError:
+                trouble = nobody_at(self.address)
+            if self._over:  # Dask may make an error of the cancellation
+                return
+            if trouble != said:
+                log.warning("%s; trying again every %.0f s", trouble, _AGAIN)
+                said = trouble
+            await asyncio.sleep(_AGAIN)
+
+    async def _meet(self) -> None:
+        """From the first word with a scheduler to the last."""
+        from distributed import Client
+
+        async with Client(
+            scheduler_of(self.address), asynchronous=True, timeout=CONNECT_SECONDS, set_as_default=False
+        ) as client:
+            try:
+                client.subscribe_topic(self._topic, self._hear)
+                self._client = client
+                greeted: dict[str, asyncio.Task[None]] = {}
+                while client.status == "running":
+                    there = set(await client.nthreads())
+                    for address in there - greeted.keys():
+                        greeted[address] = asyncio.create_task(self._greet(client, address))
+                    for address in greeted.keys() - there:
+                        greeted.pop(address).cancel()
+                        self._reports.pop(address, None)
+                    if self._reports:
+                        self.ready.set()
+                    else:
+                        self.ready.clear()
+                    await asyncio.sleep(_LOOK)
+            finally:
+                self.ready.clear()
+                self._reports.clear()
+                self._content.clear()
+
+    async def _greet(self, client: Any, address: str) -> None:
+        """Make one of the cluster's workers warm."""
+        try:
+            version, report = await client.submit(
+                cluster_worker.greet, workers=[address], pure=False, key=f"refract-greet-{secrets.token_hex(8)}"
+            )
+        except Exception as error:
+            log.warning("worker %s of the cluster takes no jobs: %s", address, _reason(error))
+            return
+        if version != engine():
+            log.warning("worker %s of the cluster has refract %s, not %s; install the same", address, version, engine())
+            return
+        self._reports[address] = report
+        log.info("worker %s of the cluster is ready", address)
+
+    def _hear(self, event: tuple[float, Any]) -> None:
+        """A message of a job, by way of the scheduler."""
+        said = event[1]
+        if isinstance(said, dict) and (remote := self._remotes.get(str(said.get("token")))):
+            message = said.get("message")
+            if isinstance(message, dict):
+                remote.messages.put_nowait(message)
+
+    # --- a job
+
+    async def send(self, remote: Remote, job: dict[str, Any]) -> Ended:
+        """Have a job done.
+
+        Raises:
+            Problem: the files of the stage cannot be told.
+            RefractError: no worker can do it.
+        """
+        root, stage = Path(job["root"]), job["stage"]
+        uploaded = root.parent == Path(job["folder"])
+        paths = (stage,) if uploaded else await self._files_of(root, job)
+        files = await asyncio.to_thread(_hashed, root, paths)
+        travels = {name: job[name] for name in ("kind", "stage", "settings", "limits")}
+        order = Order(self._topic, remote.token, travels, "" if uploaded else str(root), files, engine())
+        content = self._kept(order)
+        if uploaded and content is None:
+            content = await self._upload(remote.client, root, order)
+        ended = await self._submit(remote, order, content)
+        if ended is None:
+            ended = await self._submit(remote, order, await self._upload(remote.client, root, order))
+        if ended is None:
+            raise RefractError("the stage did not arrive")
+        return ended
+
+    async def _submit(self, remote: Remote, order: Order, content: Any) -> Ended | None:
+        remote.future = remote.client.submit(
+            cluster_worker.perform, order, content, pure=False, key=f"refract-job-{secrets.token_hex(8)}"
+        )
+        ended: Ended | None = await remote.future
+        return ended
+
+    async def _files_of(self, root: Path, job: dict[str, Any]) -> tuple[str, ...]:
+        """Paths of all a stage under the stage root is made of, looked up once for each state of that folder."""
+        from .digests import tree_digest
+
+        digest = await asyncio.to_thread(tree_digest, root, job["stage"])
+        key = (str(root), job["stage"], digest)
+        if key not in self._known:
+            self._known[key] = tuple(await files_of(str(root), job["stage"], job["limits"]))
+            while len(self._known) > _KNOWN_STAGES:
+                self._known.popitem(last=False)
+        return self._known[key]
+
+    def _kept(self, order: Order) -> Any:
+        key = _key(order)
+        if key in self._content:
+            self._content.move_to_end(key)
+        return self._content.get(key)
+
+    async def _upload(self, client: Any, root: Path, order: Order) -> Any:
+        """The files on the cluster, as something to give to tasks. Dask fetches them again where a worker is lost."""
+        content = await asyncio.to_thread(_read, root, order.files)
+        key = _key(order)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Sending large graph")  # a whole stage, but only once
+            self._content[key] = client.submit(_same, content, key=f"refract-stage-{key}", pure=False)
+        while len(self._content) > _KEPT:
+            self._content.popitem(last=False)
+        return self._content[key]
+
+
+def _same(content: dict[str, bytes]) -> dict[str, bytes]:
+    return content
+
+
+def _key(order: Order) -> str:
+    return hashlib.sha256(repr((order.job["stage"], order.files)).encode()).hexdigest()
+
+
+def _hashed(root: Path, paths: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
+    found = []
+    for path in paths:
+        with open(root / path, "rb") as file:
+            found.append((path, hashlib.file_digest(file, "sha256").hexdigest()))
+    return tuple(found)
+
+
+def _read(root: Path, files: tuple[tuple[str, str], ...]) -> dict[str, bytes]:
+    return {path: (root / path).read_bytes() for path, _ in files}
+
+
+def _leave(ended: Ended, work: Path) -> None:
+    (work / "worker.log").write_text(ended.log, "utf-8")
+    for name, data in ended.files.items():
+        if RESULTS.match(name):
+            (work / "out" / name).write_bytes(data)
+
+
+def _trouble(error: Exception) -> dict[str, Any]:
+    """What the client is told of a job that the cluster could not do; the reason is for the log."""
+    log.warning("a job could not be done on the cluster: %s", _reason(error))
+    if type(error).__name__ == "KilledWorker":
+        text = "several workers of the cluster ended while they did this job"
+        return {"problem": {"slug": "stage-crashed", "detail": text}}
+    return {"problem": {"slug": "unavailable", "detail": "no worker of the cluster could do this job"}}
+
+
+def _reason(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"

@@ -1,0 +1,40 @@
+"""What makes two requests the same: the engine, an uploaded file, a stage with all that lies around it."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+from pathlib import Path
+
+_ENGINE: list[str] = []
+
+
+def engine() -> str:
+    """Version of all that makes a result: release and sources."""
+    if not _ENGINE:
+        from refract_core.version import __version__
+
+        digest = hashlib.sha256()
+        here = Path(__file__).resolve().parents[1]
+        for path in sorted([*(here / "refract_core").rglob("*.py"), *(here / "service").glob("*.py")]):
+            digest.update(path.read_bytes())
+        _ENGINE.append(f"{__version__}+{digest.hexdigest()[:12]}")
+    return _ENGINE[0]
+
+
+def file_digest(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def tree_digest(root: Path, stage: str) -> str:
+    """Of a stage under the stage root, with whatever it may refer to there: names, sizes and times of all files."""
+    digest = hashlib.sha256(stage.encode())
+    for folder, folders, names in os.walk(root):
+        folders.sort()
+        for name in sorted(names):
+            with contextlib.suppress(OSError):
+                seen = os.stat(os.path.join(folder, name))
+                digest.update(f"{folder}/{name}\0{seen.st_size}\0{seen.st_mtime_ns}\n".encode())
+    return digest.hexdigest()

@@ -1,0 +1,197 @@
+"""What the OpenAPI document says beside what FastAPI finds by itself: headers, problems by status, bodies, tokens."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any, get_args
+
+from fastapi import FastAPI
+
+from . import models
+from .edge import guarded
+from .problems import KINDS, MEDIA_TYPE
+
+Answers = dict[int | str, dict[str, Any]]
+_PROBLEM = {"$ref": "#/components/schemas/ProblemDocument"}
+_TOKEN = "token"
+ALWAYS = (400, 431, 500)
+"""Problems that any request can meet."""
+WORK = (403, 406, 408, 409, 413, 415, 422, 429, 501, 503)
+"""Problems of a request that becomes a job, and of the job."""
+
+
+def _header(text: str, kind: str = "string", *, required: bool = True, example: str = "") -> dict[str, Any]:
+    found = {"description": text, "required": required, "schema": {"type": kind}}
+    return {**found, "example": example} if example else found
+
+
+_HEADERS_OF: dict[int, dict[str, Any]] = {
+    401: {"WWW-Authenticate": _header("Bearer")},
+    416: {"Content-Range": _header("size of the result in bytes", example="bytes */1951")},
+    429: {"Retry-After": _header("seconds after which to try again", "integer")},
+    503: {"Retry-After": _header("seconds after which to try again", "integer")},
+}
+_RESULT_HEADERS = {
+    "ETag": _header("strong; the same for the same stage, settings and engine"),
+    "Content-Location": _header("the job"),
+    "Cache-Control": _header("a result never changes"),
+    "Vary": _header("Accept, which chooses the format"),
+}
+_PATHS: dict[str, Any] = {
+    "identifier": {"type": "string", "pattern": "^[0-9a-f]{64}$"},
+    "name": {"type": "string", "enum": [name for name in get_args(models.Aov) if name != "P"]},
+}
+"""What a part of a path may be; anything else is a 404."""
+_REQUEST_ID = {"X-Request-Id": _header("in the server's log too", required=False)}
+
+
+def _parameter(name: str, text: str) -> dict[str, Any]:
+    return {"name": name, "in": "header", "required": False, "description": text, "schema": {"type": "string"}}
+
+
+PREFER = _parameter("Prefer", "`respond-async`: answer 202 with the job at once, and do the work even if nobody waits.")
+_CONDITIONS = [
+    _parameter("If-None-Match", "ETags of results that are there already; `*` stands for any. Then the answer is 304."),
+    _parameter("Range", "One range of bytes, such as `bytes=0-99`, which is answered with 206; others are ignored."),
+    _parameter("If-Range", "An ETag: the range counts only if the result still has it."),
+]
+
+
+def problems(*statuses: int) -> Answers:
+    """Answers that are problem documents."""
+    return {
+        status: {
+            "description": " or ".join(sorted({kind.title for kind in KINDS.values() if kind.status == status})),
+            "content": {MEDIA_TYPE: {"schema": _PROBLEM}}, "headers": _HEADERS_OF.get(status, {}),
+        }
+        for status in statuses
+    }  # fmt: skip
+
+
+# --- operations -------------------------------------------------------------------------------------------------------
+
+
+def work(model: type[models.StageOnly], what: str, content: dict[str, Any]) -> dict[str, Any]:
+    """Keywords for a route that takes a stage.
+
+    Args:
+        model: of the JSON body.
+        what: the answer.
+        content: media type of the answer -> its description.
+    """
+    done = {"description": what, "content": content, "headers": _RESULT_HEADERS}
+    accepted = {
+        "model": models.Job, "description": "with `Prefer: respond-async`: the job",
+        "headers": {"Location": _header("address of the job"), "Preference-Applied": _header("respond-async")},
+    }  # fmt: skip
+    extra = {"parameters": [PREFER], "requestBody": _body(model)}
+    return {"openapi_extra": extra, "responses": {200: done, 202: accepted, **problems(*WORK)}}
+
+
+def result(what: str, *media: str) -> dict[str, Any]:
+    """Keywords for a route that gives one file of a job."""
+    content: dict[str, Any] = {one: {} for one in media}
+    whole = {"description": what, "content": content, "headers": _RESULT_HEADERS}
+    part = {
+        "description": "with `Range`: a part of it", "content": content,
+        "headers": {**_RESULT_HEADERS, "Content-Range": _header("which part", example="bytes 0-99/1951")},
+    }  # fmt: skip
+    same = {"description": "with `If-None-Match`: it is there already", "headers": _RESULT_HEADERS}
+    answers = {200: whole, 206: part, 304: same, **problems(404, 409, 416)}
+    return {"openapi_extra": {"parameters": _CONDITIONS}, "responses": answers}
+
+
+def _body(model: type[models.StageOnly]) -> dict[str, Any]:
+    """A stage of ours by its name in JSON, or an uploaded one with settings beside it."""
+    schema = _inlined(model)
+    stage = schema["properties"].pop("stage")
+    named = {key: value for key, value in stage["anyOf"][0].items() if key != "title"}
+    ours = {**schema, "required": ["stage"], "properties": {
+        "stage": {**named, "title": "Stage", "description": "a stage of GET /v1/stages"}, **schema["properties"],
+    }}  # fmt: skip
+    settings = {"type": "string", "contentMediaType": "application/json", "contentSchema": schema}
+    form = {
+        "type": "object", "required": ["stage"], "additionalProperties": False,
+        "properties": {"stage": {"type": "string", "format": "binary"}, "settings": settings},
+    }  # fmt: skip
+    content = {"application/json": {"schema": ours}, "multipart/form-data": {"schema": form}}
+    return {"required": True, "content": content}
+
+
+def _inlined(model: type[models.StageOnly]) -> dict[str, Any]:
+    """The schema with its definitions in place, for a document that has no room of ours for them."""
+    schema = model.model_json_schema()
+    known = schema.pop("$defs", {})
+
+    def put(value: Any) -> Any:
+        if isinstance(value, dict):
+            if "$ref" in value:
+                return put(known[value["$ref"].rpartition("/")[2]])
+            if "patternProperties" in value:  # by which pydantic means that every name must fit
+                value = {**value}
+                ((pattern, inner),) = value.pop("patternProperties").items()
+                names = {**value.get("propertyNames", {}), "pattern": pattern}
+                value |= {"propertyNames": names, "additionalProperties": inner}
+            return {key: put(inner) for key, inner in value.items()}
+        return [put(inner) for inner in value] if isinstance(value, list) else value
+
+    found: dict[str, Any] = put(schema)
+    return found
+
+
+# --- the document -----------------------------------------------------------------------------------------------------
+
+
+def describe(app: FastAPI, *, tokens: bool) -> None:
+    """Let the app's document tell all of this.
+
+    Args:
+        tokens: the service asks for a bearer token.
+    """
+    plain: Callable[[], dict[str, Any]] = app.openapi
+    ready: list[dict[str, Any]] = []
+
+    def document() -> dict[str, Any]:
+        if not ready:
+            ready.append(_completed(plain(), tokens))
+        return ready[0]
+
+    app.openapi = document  # type: ignore[method-assign]
+
+
+def _completed(found: dict[str, Any], tokens: bool) -> dict[str, Any]:
+    found["info"]["description"] += (
+        " Every error is a problem document (RFC 9457). HEAD is answered wherever GET is, without the body."
+    )
+    for path, operations in found["paths"].items():
+        for operation in operations.values():
+            _complete(operation, guarded(path) and tokens)
+    numbers = found["paths"]["/metrics"]["get"]["responses"]["200"]
+    numbers["content"] = {"text/plain": {"schema": {"type": "string"}}}
+    parts = found.setdefault("components", {})
+    for name in ("HTTPValidationError", "ValidationError"):  # FastAPI's own, which nobody is ever sent
+        parts.get("schemas", {}).pop(name, None)
+    if tokens:
+        parts["securitySchemes"] = {_TOKEN: {"type": "http", "scheme": "bearer"}}
+    return found
+
+
+def _complete(operation: dict[str, Any], guard: bool) -> None:
+    answers = operation["responses"]
+    if "application/json" in answers.get("422", {}).get("content", {}):
+        del answers["422"]
+    for parameter in operation.get("parameters", ()):
+        parameter["schema"] = _PATHS.get(parameter["name"], parameter["schema"])
+    if guard:
+        operation["security"] = [{_TOKEN: []}]
+    _add(answers, (*ALWAYS, 401) if guard else ALWAYS)
+    for status, answer in answers.items():
+        answer["headers"] = {**_HEADERS_OF.get(int(status), {}), **answer.get("headers", {}), **_REQUEST_ID}
+        if MEDIA_TYPE in answer.get("content", {}):
+            answer["content"][MEDIA_TYPE] = {"schema": _PROBLEM}
+    operation["responses"] = dict(sorted(answers.items()))
+
+
+def _add(answers: dict[str, Any], statuses: Iterable[int]) -> None:
+    for status, answer in problems(*statuses).items():
+        answers.setdefault(str(status), answer)
