@@ -12,6 +12,8 @@ from .errors import UsageError
 
 MODES = ("auto", "json", "none")
 
+COMPILING = "compiling kernels (first run only, about a minute)"
+"""The one stage of work that is told without a terminal too: whoever waits for so long must know why."""
 _STEP = 0.01
 """Smallest advance worth a line of JSON."""
 
@@ -47,7 +49,23 @@ def reporting(mode: str) -> Iterator[Report]:
         with _bar() as report:
             yield report
     else:
-        yield Report(lambda _fraction, _stage: None, _print_warning, lambda _path, _text: None, _print_error)
+        progress = _nothing if mode == "none" else _tell_compiling()
+        yield Report(progress, _print_warning, lambda _path, _text: None, _print_error)
+
+
+def _nothing(_fraction: float, _stage: str) -> None:
+    pass
+
+
+def _tell_compiling() -> Callable[[float, str], None]:
+    said: list[str] = []
+
+    def progress(_fraction: float, stage: str) -> None:
+        if stage.endswith(COMPILING) and not said:
+            said.append(stage)
+            print(COMPILING, file=sys.stderr, flush=True)
+
+    return progress
 
 
 def _print_warning(path: str, text: str) -> None:

@@ -27,6 +27,7 @@ from .plan import Plan, plan_capture, plan_picture
 from .planes import Planes, add_tile, by_name, finish_of, finish_tile, new_planes
 from .pointer import Pointer
 from .probes import empty_table
+from .progress import COMPILING
 from .pyramid import Screen, ScreenBuffers, blur_level, fill_depth_levels, new_screen_buffers
 from .refraction import Choices, LayerResult, new_layer_result, put_tile, refract_tile
 from .sampling import pixel_offset
@@ -86,6 +87,12 @@ class Session(NamedTuple):
     notices: tuple[Notice, ...]
 
 
+def _file_name(stage: str) -> str:
+    """A stage's name without its folders, which are nobody's business: pictures are handed around."""
+    file, bracket, inside = stage.partition("[")
+    return os.path.basename(file) + bracket + inside
+
+
 def render(
     scene: Scene,
     settings: RenderSettings | None = None,
@@ -114,7 +121,7 @@ def render(
     try:
         work = Work(executor or own, progress or (lambda _f, _s: None), cancel or (lambda: False))  # type: ignore[arg-type]
         if not is_compiled(refract_tile):
-            work.progress(0.0, "compiling kernels (first run only, about a minute)")
+            work.progress(0.0, COMPILING)
         session = prepare(scene, camera, settings, height, work)
         planes, rays = _draw(session, scene, camera, settings, (width, height), work)
     finally:
@@ -123,7 +130,7 @@ def render(
     work.progress(1.0, "done")
     metadata: dict[str, str | float] = {
         "software": f"refract {__version__}",
-        "refract:stage": scene.name,
+        "refract:stage": _file_name(scene.name),
         "refract:camera": camera.path,
         "refract:timeCode": scene.time_code,
         "refract:samples": float(settings.samples),

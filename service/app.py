@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import shutil
 from collections.abc import AsyncIterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -73,8 +74,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     """
     settings = settings or Settings()
     metrics = Metrics()
+    data = Path(settings.data or mkdtemp(prefix="refract-service-")).resolve()
     try:
-        store = Store(Path(settings.data or mkdtemp(prefix="refract-service-")).resolve())
+        store = Store(data)
     except OSError as error:
         raise UsageError(f"--data {settings.data}: cannot be used: {error.strerror}") from error
     root = Path(settings.stage_root).resolve() if settings.stage_root else None
@@ -90,6 +92,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             yield
         finally:
             await jobs.stop()
+            if not settings.data:
+                shutil.rmtree(data, ignore_errors=True)
 
     app = FastAPI(
         title="refract", version=__version__, docs_url=None, redoc_url=None, lifespan=lifespan,

@@ -27,7 +27,7 @@ from .problems import KINDS, Problem
 from .store import Record, Store, now
 
 log = logging.getLogger("refract.service")
-_SWEEP = 30.0  # [s]
+_SWEEP = 10.0  # [s]
 
 
 class _Plane(BaseModel):
@@ -319,7 +319,13 @@ class Jobs:
                 log.exception("old jobs could not be removed")
 
     def sweep(self) -> None:
-        """Remove results that are too old, or too much."""
+        """End jobs that have waited too long; remove results that are too old, or too much."""
+        longest = timedelta(seconds=self.limits.queue_seconds)
+        for identifier in list(self._active):
+            record = self.records[identifier]
+            if record.status == "queued" and datetime.now(UTC) - datetime.fromisoformat(record.created) > longest:
+                text = f"no worker was free within {self.limits.queue_seconds} s"
+                self._end(record, "failed", Problem("unavailable", text))
         ended = sorted((r for r in self.records.values() if r.ended), key=lambda r: r.finished or "", reverse=True)
         oldest = (datetime.now(UTC) - timedelta(seconds=self.limits.retention_seconds)).isoformat()
         total = 0

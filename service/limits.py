@@ -36,6 +36,7 @@ class Limits:
     aovs: int = _limit(16, "planes", "AOVs of one request")
     triangles: int = _limit(20_000_000, "triangles", "triangles of a stage, instances counted")
     texture_pixels: int = _limit(1 << 26, "pixels", "one texture")
+    queue_seconds: int = _limit(600, "s", "time a job may wait for a worker")
     job_seconds: int = _limit(120, "s", "wall clock of one job, without its time in the queue")
     cpu_seconds: int = _limit(300, "s", "processor time of one job, all threads together")
     memory_bytes: int = _limit(4 << 30, "bytes", "address space of one job beyond that of an idle worker")

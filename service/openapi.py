@@ -34,6 +34,7 @@ _HEADERS_OF: dict[int, dict[str, Any]] = {
 _RESULT_HEADERS = {
     "ETag": _header("strong; the same for the same stage, settings and engine"),
     "Content-Location": _header("the job"),
+    "Refract-Warnings": _header("how many warnings the job has; it tells them", "integer"),
     "Cache-Control": _header("a result never changes"),
     "Vary": _header("Accept, which chooses the format"),
 }

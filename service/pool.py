@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import logging
 import secrets
 import socket
 import subprocess
@@ -14,6 +15,7 @@ from typing import Any, Protocol
 
 from .worker import environment
 
+log = logging.getLogger("refract.service")
 _LINE = 1 << 20
 """Longest message of a worker [bytes]."""
 
@@ -110,6 +112,9 @@ class Nursery:
             started = asyncio.get_running_loop().time()
             try:
                 await self._run()
+                log.warning("the process that forks workers has ended; it is started anew")
+            except Exception:  # whatever keeps it from starting may pass
+                log.exception("the process that forks workers cannot be started; trying again in %.1f s", wait)
             finally:
                 self.ready.clear()
                 self._end()
@@ -128,12 +133,14 @@ class Nursery:
                 [sys.executable, "-m", "service.worker", str(theirs.fileno())], pass_fds=[theirs.fileno()],
                 cwd=Path(__file__).parents[1], env=environment(), stdin=subprocess.DEVNULL, stdout=2,
             )  # fmt: skip
+        log.info("the first worker is getting warm; where kernels are to be compiled first, it takes about a minute")
         loop = asyncio.get_running_loop()
         while data := await loop.sock_recv(ours, 65536):
             message = json.loads(data)
             if "ready" in message:
                 self.report = message["ready"]
                 self.ready.set()
+                log.info("ready for jobs")
             elif "ended" in message and (worker := self._workers.pop(message["ended"], None)):
                 worker.code.set_result(message["code"])
 

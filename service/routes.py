@@ -229,8 +229,8 @@ def _result(request: Request, jobs: Jobs, record: Record, name: str) -> Response
     if not RESULTS.match(name) or not path.is_file():
         raise Problem("not-found", "the job has no such result")
     tag = f'"{record.id}-{name}"'
-    headers = {"ETag": tag, "Cache-Control": "private, max-age=3600, immutable",
-               "Content-Location": f"/v1/jobs/{record.id}", "Vary": "Accept"}  # fmt: skip
+    headers = {"ETag": tag, "Cache-Control": "private, max-age=3600, immutable", "Vary": "Accept",
+               "Content-Location": f"/v1/jobs/{record.id}", "Refract-Warnings": str(len(record.warnings))}  # fmt: skip
     asked = [one.strip().removeprefix("W/") for one in request.headers.get("if-none-match", "").split(",")]
     if request.method == "GET" and (tag in asked or "*" in asked):
         return Response(status_code=304, headers=headers)

@@ -113,8 +113,7 @@ def _render(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[s
     correction = settings.get("color_correction") or "sRGB"
     aovs = settings.get("aovs") or []
     extension = settings["format"]
-    notes = {**override_notes(overrides), "refract:stage": os.path.basename(stage)}
-    frame = replace(frame, metadata={**frame.metadata, **notes})
+    frame = replace(frame, metadata={**frame.metadata, **override_notes(overrides)})
     frame.save(os.path.join(out, f"image.{extension}"), aovs=aovs if extension == "exr" else (),
                color_correction=correction)  # fmt: skip
     kept = []

@@ -105,9 +105,12 @@ def until(true: Any, seconds: float = 60.0) -> None:
 
 
 @contextmanager
-def running(data: Path, *words: str, environment: dict[str, str] | None = None) -> Iterator[Server]:
-    """Start the service as a user would, and stop it."""
-    command = [sys.executable, "-m", "refract_core.cli", "serve", "--port", "0", "--data", str(data), *words]
+def running(
+    data: Path, *words: str, environment: dict[str, str] | None = None, own_data: bool = True
+) -> Iterator[Server]:
+    """Start the service as a user would, and stop it. `own_data`: `data` is its folder, else it makes one itself."""
+    folder = ("--data", str(data)) if own_data else ()
+    command = [sys.executable, "-m", "refract_core.cli", "serve", "--port", "0", *folder, *words]
     log = data.parent / f"{data.name}.log"
     with open(log, "w") as errors:
         variables = {**os.environ, **(environment or {})}

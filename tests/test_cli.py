@@ -20,6 +20,7 @@ import refract_core as rc
 from refract_core.cli import app
 from refract_core.errors import Cancelled, SceneError, UsageError
 from refract_core.image import read_texture
+from refract_core.progress import COMPILING, reporting
 from refract_core.scene import Notice
 
 ROOT = Path(__file__).parents[1]
@@ -178,6 +179,16 @@ def test_warnings_come_once_and_nothing_goes_to_stdout(engine: Engine, tmp_path:
     ended = refract("render", "a.usda", tmp_path / "a.#.png", "-f", "1:3")
     assert ended.out == ""
     assert ended.err == "warning: /World/Glass: is guessed\n"
+
+
+def test_without_a_terminal_only_the_long_wait_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    with reporting("auto") as report:
+        for stage in ("reading the stage", COMPILING, COMPILING, "image"):
+            report.progress(0.5, stage)
+    assert capsys.readouterr().err == f"{COMPILING}\n"
+    with reporting("none") as report:
+        report.progress(0.5, COMPILING)
+    assert capsys.readouterr().err == ""
 
 
 def test_json_progress_is_one_object_per_line(engine: Engine, tmp_path: Path) -> None:

@@ -153,6 +153,25 @@ def test_a_stage_that_cannot_be_opened_is_said_to_be_so(page: Any) -> None:
     )
     playwright.expect(page.get_by_role("alert")).to_contain_text("broken.usda is not a USD file.")
     assert page.get_by_role("button", name="Render", exact=True).is_disabled()
+    status(page, "Pick a stage to begin.")
+
+
+def test_nothing_stays_of_a_stage_once_another_cannot_be_opened(page: Any) -> None:
+    pick(page)
+    assert page.locator("#glass [data-path]").count() > 0
+    page.get_by_label("Drop a USD file here").set_input_files(
+        {"name": "broken.usda", "mimeType": "text/plain", "buffer": b"no"}
+    )
+    status(page, "Pick a stage to begin.")
+    assert page.locator("#glass [data-path]").count() == 0
+
+
+def test_a_picture_with_notices_says_so(page: Any) -> None:
+    pick(page)
+    page.get_by_label("Samples per pixel").fill("2")
+    status(page, "Done with 1 notice, below.")
+    page.get_by_text("Notices (2)").click()
+    playwright.expect(page.locator("#notices-list")).to_contain_text("/World/Block: drawn unrefined")
 
 
 def test_two_settings_and_one_slider(page: Any, service: FakeService) -> None:
@@ -246,7 +265,7 @@ def test_a_token_is_asked_for_where_one_is_needed(page: Any, service: FakeServic
 
 def test_text_of_a_stage_is_never_markup(page: Any) -> None:
     pick(page)
-    page.get_by_text("Notices (2)").click()
+    page.get_by_text("Notices (1)").click()
     playwright.expect(page.locator("#notices-list")).to_contain_text("<b>odd</b>")
     assert page.locator("#notices-list b").count() == 0
 

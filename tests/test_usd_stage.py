@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pxr import Gf, Usd, UsdGeom, UsdSkel
+from pxr import Gf, Usd, UsdGeom, UsdSkel, UsdUtils
 from scene_reading import CUBE, drawn, read, signed_volume, stage_of, texts, to_stage
 
 from refract_core.errors import StageError, UsageError
@@ -45,6 +45,18 @@ def test_a_file_that_is_not_usd_is_named_with_what_usd_says(name: str, tmp_path:
     path.write_bytes(b"certainly not")
     with pytest.raises(StageError, match=rf"{name}: cannot be read as \.usd, \.usda, \.usdc or \.usdz: \S+"):
         load_stage(path)
+
+
+def test_a_package_that_was_cut_off_is_no_empty_stage(tmp_path: Path) -> None:
+    stage = write(tmp_path / "s.usda", BALL)
+    whole = tmp_path / "whole.usdz"
+    assert UsdUtils.CreateNewUsdzPackage(str(stage), str(whole))
+    assert load_stage(whole).spheres
+    data = whole.read_bytes()
+    for size in (len(data) - 30, len(data) // 2, 100):
+        whole.write_bytes(data[:size])
+        with pytest.raises(StageError, match="was cut off"):
+            load_stage(whole)
 
 
 def test_nothing_of_usd_reaches_stderr_and_a_broken_reference_is_a_notice(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -52,6 +53,9 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
         raise StageError(f"{name or 'the stage path'}: there is no such file; check the path")
     if file.is_dir():
         raise StageError(f"{name}: is a folder; name a .usd, .usda, .usdc or .usdz file in it")
+    if file.suffix.lower() == ".usdz" and not zipfile.is_zipfile(file):  # USD may open what is left as an empty stage
+        reason = "the package has no directory at its end, so it was cut off; copy or pack it again"
+        raise StageError(f"{name}: cannot be read as .usd, .usda, .usdc or .usdz: {reason}")
     with captured() as heard:
         try:
             stage = Usd.Stage.Open(name)

@@ -11,3 +11,5 @@ export function make(tag, props = {}, ...children) {
 export function say(text) {
   if ($("status").textContent !== text) $("status").textContent = text;
 }
+
+export const counted = (count, noun) => `${count} ${noun}${count === 1 ? "" : "s"}`;

@@ -7,9 +7,9 @@ import { MODELS, NUMBERS } from "./settings.js";
 import { SIDES, state, tell, update } from "./state.js";
 import { drawTiers } from "./tiers.js";
 
-/** Controls that depend on what is in the stage. */
+/** Controls that depend on what is in the stage; without one, none. */
 export function drawChoices() {
-  const { facts } = state;
+  const facts = state.facts ?? {};
   const cameras = (facts.cameras ?? []).map(({ path }) => make("option", { value: path, textContent: path }));
   $("set-camera").replaceChildren(make("option", { value: "", textContent: "automatic" }), ...cameras);
   $("time-field").hidden = !facts.time?.authored || facts.time.start === facts.time.end;

@@ -23,7 +23,7 @@ export function hexOf(linear) {
 export function drawGlass(facts) {
   const materials = new Map();
   for (const piece of facts.glass ?? []) materials.set(piece.material, [...(materials.get(piece.material) ?? []), piece]);
-  $("glass-none").hidden = materials.size > 0;
+  $("glass-none").hidden = materials.size > 0 || !facts.glass;
   $("glass-none").textContent = "No glass was found in this stage.";
   $("glass").replaceChildren(...[...materials].map(([path, pieces], place) => glassControls(path, pieces, place)));
 }

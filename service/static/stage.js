@@ -1,7 +1,7 @@
 // Which stage is looked at: a sample of the server, or a file that is dropped or chosen.
 
 import { bodyOf, send } from "./api.js";
-import { $, make } from "./dom.js";
+import { $, counted, make } from "./dom.js";
 import { drawChoices } from "./form.js";
 import { changed, stopAll } from "./jobs.js";
 import { clearProblem, report } from "./problems.js";
@@ -36,6 +36,8 @@ export async function choose(source, link = null) {
     if (state.source !== waiting) return;
     state.source = null;
     $("facts").textContent = `${source.name} could not be opened.`;
+    drawChoices();
+    tell("all");
     report(error);
     return;
   }
@@ -56,8 +58,6 @@ function factsText(name, facts) {
     `${counted(facts.probes?.length ?? 0, "probe")}, ${facts.up_axis} up, ${facts.metres_per_unit} m per unit` +
     (worry ? `; ${counted(worry, "thing")} to look at, under Notices.` : ".");
 }
-
-const counted = (count, noun) => `${count} ${noun}${count === 1 ? "" : "s"}`;
 
 function openFile(file) {
   if (!file) return;

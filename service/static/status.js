@@ -1,6 +1,6 @@
 // What the page says of its runs: progress, notices, and which buttons work.
 
-import { $, make, say } from "./dom.js";
+import { $, counted, make, say } from "./dom.js";
 import { ACTIVE, SIDES, keyOf, sides, state } from "./state.js";
 
 export function showProgress() {
@@ -26,7 +26,8 @@ function statusText() {
     if (!run) return "";
     if (run.key !== keyOf(side)) return `${name}${$("auto").checked ? "changed, about to render" : "changed, not rendered yet"}`;
     if (run.status === "running") return `${name}rendering, ${Math.floor(run.fraction * 4) * 25} %`;
-    return `${name}${run.status}`;
+    const warnings = run.job?.warnings?.length ?? 0;
+    return `${name}${run.status}${run.status === "done" && warnings ? ` with ${counted(warnings, "notice")}, below` : ""}`;
   }).filter(Boolean);
   const text = said.join("; ");
   return text ? `${text[0].toUpperCase()}${text.slice(1)}.` : "Ready to render.";
