@@ -22,7 +22,7 @@ from refract_core.executors import CONNECT_SECONDS, nobody_at, scheduler_of, sil
 
 from . import cluster_worker
 from .cluster_worker import Ended, Order
-from .digests import engine
+from .digests import engine, tree_digest
 from .gather import files_of
 from .pool import Worker
 from .problems import Problem
@@ -212,12 +212,12 @@ class Cluster:
         files = await asyncio.to_thread(_hashed, root, paths)
         travels = {name: job[name] for name in ("kind", "stage", "settings", "limits")}
         order = Order(self._topic, remote.token, travels, "" if uploaded else str(root), files, engine())
-        content = self._kept(order)
-        if uploaded and content is None:
-            content = await self._upload(remote.client, root, order)
-        ended = await self._submit(remote, order, content)
+        ended = None if uploaded else await self._submit(remote, order, self._content.get(_key(order)))
         if ended is None:
-            ended = await self._submit(remote, order, await self._upload(remote.client, root, order))
+            content = await self._shared(remote.client, root, order)
+            if not uploaded:  # of a client's stage, nothing stays
+                self._keep_content(_key(order), content)
+            ended = await self._submit(remote, order, content)
         if ended is None:
             raise RefractError("the stage did not arrive")
         return ended
@@ -231,8 +231,6 @@ class Cluster:
 
     async def _files_of(self, root: Path, job: dict[str, Any]) -> tuple[str, ...]:
         """Paths of all a stage under the stage root is made of, looked up once for each state of that folder."""
-        from .digests import tree_digest
-
         digest = await asyncio.to_thread(tree_digest, root, job["stage"])
         key = (str(root), job["stage"], digest)
         if key not in self._known:
@@ -241,22 +239,17 @@ class Cluster:
                 self._known.popitem(last=False)
         return self._known[key]
 
-    def _kept(self, order: Order) -> Any:
-        key = _key(order)
-        if key in self._content:
-            self._content.move_to_end(key)
-        return self._content.get(key)
-
-    async def _upload(self, client: Any, root: Path, order: Order) -> Any:
-        """The files on the cluster, as something to give to tasks. Dask fetches them again where a worker is lost."""
+    async def _shared(self, client: Any, root: Path, order: Order) -> Any:
+        """The files on the cluster, as something to give to tasks. Dask makes them again where a worker is lost."""
         content = await asyncio.to_thread(_read, root, order.files)
-        key = _key(order)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Sending large graph")  # a whole stage, but only once
-            self._content[key] = client.submit(_same, content, key=f"refract-stage-{key}", pure=False)
+            return client.submit(_same, content, key=f"refract-stage-{secrets.token_hex(8)}", pure=False)
+
+    def _keep_content(self, key: str, content: Any) -> None:
+        self._content[key] = content
         while len(self._content) > _KEPT:
             self._content.popitem(last=False)
-        return self._content[key]
 
 
 def _same(content: dict[str, bytes]) -> dict[str, bytes]:

@@ -50,7 +50,16 @@ async def files_of(root: str, stage: str, limits: Mapping[str, int]) -> list[str
         raise Problem("stage-crashed", how) from None
     if "problem" in answer:
         raise Problem(answer["problem"]["slug"], answer["problem"]["detail"])
-    return [str(path) for path in answer["files"]]
+    return checked([str(path) for path in answer["files"]], root)
+
+
+def checked(paths: list[str], root: str) -> list[str]:
+    """The same paths, if they all lie under `root`: they come from a process that has read a stranger's stage."""
+    top = os.path.realpath(root)
+    for path in paths:
+        if os.path.commonpath([top, os.path.realpath(os.path.join(top, path))]) != top:
+            raise Problem("stage-refused", "the stage refers to something outside the stage root")
+    return paths
 
 
 def _look(root: str, stage: str, layers: int, unpacked_bytes: int) -> dict[str, Any]:

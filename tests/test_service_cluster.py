@@ -25,7 +25,7 @@ from refract_core.cli import app
 from refract_core.errors import RefractError
 from service.cluster_worker import Ended, Order, perform
 from service.digests import engine
-from service.gather import files_of
+from service.gather import checked, files_of
 from service.limits import Limits
 from service.problems import Problem
 
@@ -198,6 +198,15 @@ def test_the_files_of_a_stage_are_found_by_a_locked_process(tmp_path: Path) -> N
     with pytest.raises(Problem, match="leads out of") as refused:
         asyncio.run(ask(tmp_path / "root", "out.usda"))
     assert refused.value.slug == "stage-refused"
+
+
+def test_the_locked_process_is_not_believed(tmp_path: Path) -> None:
+    (tmp_path / "root").mkdir()
+    (tmp_path / "root" / "link").symlink_to(tmp_path)
+    assert checked(["a.usda", "b/../c.usda"], str(tmp_path / "root")) == ["a.usda", "b/../c.usda"]
+    for path in ("../x", "/etc/passwd", "a/../../x", "link/x"):
+        with pytest.raises(Problem):
+            checked(["a.usda", path], str(tmp_path / "root"))
 
 
 # --- clusters that are not there
