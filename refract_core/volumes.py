@@ -194,7 +194,6 @@ def update_headroom(h: float, w: float) -> tuple[float, float]:
     return spent, w - min(max(total - spent, 0.0), 1.0)
 
 
-@inlined
 def distance_fade(distance: float, fade_distance: float) -> float:
     """Weight of a probe by its distance to the camera: 1 up to 0.9 `fade_distance`, 0 from it on [m] (HDRP)."""
     if distance >= fade_distance:
