@@ -119,7 +119,8 @@ def _are_here(root: str, files: tuple[tuple[str, str], ...]) -> bool:
 def _put(folder: Path, content: Mapping[str, bytes]) -> None:
     for name, data in content.items():
         path = folder / name
-        assert path.resolve().is_relative_to(folder.resolve())
+        if not path.resolve().is_relative_to(folder.resolve()):
+            raise RefractError(f"{name} is not a path inside the stage root")
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
 

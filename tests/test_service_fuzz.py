@@ -1,6 +1,6 @@
 """Damaged stages, byte by byte: every one is drawn, described or refused in our own words, and nothing else happens.
 
-40 files in the normal run; `REFRACT_FUZZ=500` sends 500.
+500 files; `REFRACT_FUZZ=5000` sends 5000.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import httpx
@@ -23,7 +24,8 @@ from service_server import BALL, ROOT, SMALL, Server, running, until, upload
 
 from service.problems import KINDS
 
-COUNT = int(os.environ.get("REFRACT_FUZZ", "40"))
+COUNT = int(os.environ.get("REFRACT_FUZZ", "500"))
+WORKERS = 2
 GOOD = ROOT / "usd_samples" / "good"
 SAMPLES = ("room_of_checkers", "baked_and_realtime")
 """One with a texture and a room, one of several layers with glass and probes."""
@@ -174,7 +176,7 @@ def wrong(answer: httpx.Response, content: bytes, places: list[str]) -> tuple[st
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    words = ("--workers", "1", "--limit", "job_seconds=20", "--limit", "memory_bytes=2000000000",
+    words = ("--workers", str(WORKERS), "--limit", "job_seconds=20", "--limit", "memory_bytes=2000000000",
              "--limit", "cpu_seconds=20")  # fmt: skip
     with running(tmp_path_factory.mktemp("fuzz") / "data", *words) as server:
         yield server
@@ -198,8 +200,8 @@ def _draws(server: Server, exposure: float) -> None:
 
 def _left(server: Server) -> dict[str, Any]:
     """What an idle service holds."""
-    until(lambda: len(list((server.data / "work").iterdir())) == 1)  # of the next worker
-    until(lambda: len(server.workers()) == 1)
+    until(lambda: len(list((server.data / "work").iterdir())) == WORKERS)  # of the next workers
+    until(lambda: len(server.workers()) == WORKERS)
     uploads = [path.name for path in server.data.rglob("*") if re.match(r"stage\.|upload-|\.[0-9a-f]{8}$", path.name)]
     handles = {name: len(os.listdir(f"/proc/{pid}/fd"))
                for name, pid in (("service", server.process.pid), ("nursery", server.nursery()))}  # fmt: skip
@@ -213,16 +215,20 @@ def test_damaged_files_cost_nothing_but_themselves(server: Server, sources: dict
     failures: list[str] = []
     _draws(server, exposure=0.0)
     before = _left(server)
+
+    def send_damaged(seed: int) -> None:
+        name, content = damaged(sources, seed)
+        for verb, settings in _ways(seed):
+            answer = _send(client, verb, name, content, settings)
+            outcome, found = wrong(answer, content, places)
+            if where := answer.headers.get("content-location"):
+                found += told(client.get(where), content, places)
+            outcomes[(verb, name.rpartition(".")[2], outcome)] += 1
+            failures.extend(f"seed {seed} {verb} {name}: {text[:300]}" for text in found)
+
     with server.client() as client:
-        for seed in range(COUNT):
-            name, content = damaged(sources, seed)
-            for verb, settings in _ways(seed):
-                answer = _send(client, verb, name, content, settings)
-                outcome, found = wrong(answer, content, places)
-                if where := answer.headers.get("content-location"):
-                    found += told(client.get(where), content, places)
-                outcomes[(verb, name.rpartition(".")[2], outcome)] += 1
-                failures += [f"seed {seed} {verb} {name}: {text[:300]}" for text in found]
+        with ThreadPoolExecutor(WORKERS) as threads:
+            list(threads.map(send_damaged, range(COUNT)))
         assert client.get("/livez").status_code == client.get("/readyz").status_code == 200
     _draws(server, exposure=1.0)
     for (verb, extension, outcome), count in sorted(outcomes.items()):
