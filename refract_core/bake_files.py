@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from .errors import StageError
+from .files import folder_beside
 from .scene import Probe
 
 _BATCH = 16
@@ -55,24 +55,20 @@ def file_names(paths: Iterable[str]) -> dict[str, str]:
 
 @contextmanager
 def texture_folder(out: str) -> Iterator[str]:
-    """Where textures are written: beside OUT, or for a package in a temporary folder. Not left behind empty."""
-    stem, extension = os.path.splitext(os.path.abspath(out))
-    if extension.lower() == ".usdz":
-        with tempfile.TemporaryDirectory(prefix="refract-bake-") as scratch:
-            yield scratch
-        return
-    folder = Path(f"{stem}.probes")
-    try:
-        folder.mkdir(exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise StageError(f"{folder}: is not a folder that textures can be written to: {error.strerror}") from error
-    try:
-        yield str(folder)
-    finally:
-        if not any(folder.iterdir()):
-            folder.rmdir()
+    """Where textures are written, tried before the work. Not left behind empty."""
+    with folder_beside(out, "probes") as place:
+        folder = Path(place)
+        try:
+            folder.mkdir(exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                pass
+        except OSError as error:
+            raise StageError(f"{folder}: is not a folder that textures can be written to: {error.strerror}") from error
+        try:
+            yield place
+        finally:
+            if not any(folder.iterdir()):
+                folder.rmdir()
 
 
 def batches(tasks: list[Task]) -> Iterator[list[Task]]:

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import fnmatch
 import os
-import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .bake_files import file_names
 from .errors import Cancelled, StageError, UsageError
+from .files import folder_beside
 from .measure_thickness import How, Row, Work, measure_all
 from .progress import Report
 from .scene import F32, Notice
@@ -86,7 +85,7 @@ def bake_thickness(order: ThicknessOrder, report: Report, cancel: Callable[[], b
         report.warning(notice.path, notice.text)
     if not chosen:
         report.warning(order.stage, "has no glass; OUT is a layer that changes nothing")
-    with _folder(order.out) as folder:
+    with folder_beside(order.out, "thickness") as folder:
         files = _files(chosen, folder) if order.texture else {}
         if not (order.overwrite or is_over(order.out, order.stage, made=MADE)):
             _refuse_existing(files.values())
@@ -187,17 +186,6 @@ def _refuse_existing(files: Iterable[str]) -> None:
     for file in files:
         if os.path.lexists(file):
             raise UsageError(f"{file}: exists already; choose another OUT, or replace it with --overwrite")
-
-
-@contextmanager
-def _folder(out: str) -> Iterator[str]:
-    """Where pictures go: beside OUT, or for a package, which takes them in, somewhere else."""
-    stem, extension = os.path.splitext(os.path.abspath(out))
-    if extension.lower() == ".usdz":
-        with tempfile.TemporaryDirectory(prefix="refract-bake-") as scratch:
-            yield scratch
-    else:
-        yield f"{stem}.thickness"
 
 
 def _write_pictures(pictures: dict[str, F32]) -> None:

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import fnmatch
 import os
-import tempfile
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from .errors import Cancelled, StageError, UsageError
-from .files import replacing
+from .files import folder_beside, replacing
 from .fit import alike, together
 from .scene import Model, Notice
 from .settings import MODELS
@@ -117,7 +115,7 @@ def convert(
 
     write.check_out(order.stage, order.out, overwrite=order.overwrite)
     progress(0.0, "opening")
-    with _folder_for_pictures(order.out) as folder:
+    with folder_beside(order.out, "textures") as folder:
         work, found, pictures = _look(order, folder)
         chosen = _chosen(found, order.only)
         _go_on(cancel)
@@ -153,17 +151,6 @@ def _look(order: ConvertOrder, pictures: str) -> tuple[Work, list[Glass], dict[s
         return work, found, content
     work = usd.begin(order.stage, flatten=order.flatten)
     return work, convert_find.find_glass(work.stage, work.time, work.unit), {}
-
-
-@contextmanager
-def _folder_for_pictures(out: str) -> Iterator[str]:
-    """Where the pictures of a glTF file go: beside OUT, or for a package, which takes them in, somewhere else."""
-    stem, extension = os.path.splitext(os.path.abspath(out))
-    if extension.lower() != ".usdz":
-        yield f"{stem}.textures"
-        return
-    with tempfile.TemporaryDirectory(prefix="refract-") as folder:
-        yield folder
 
 
 def _check_pictures(pictures: dict[str, bytes], overwrite: bool) -> None:

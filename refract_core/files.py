@@ -47,3 +47,16 @@ def replacing(path: str, error: type[RefractError]) -> Iterator[str]:
         raise error(f"{path}: cannot be written: {reason.strerror or reason}; choose another place") from reason
     finally:
         Path(temporary).unlink(missing_ok=True)
+
+
+@contextmanager
+def folder_beside(out: str, suffix: str) -> Iterator[str]:
+    """Where files go that OUT refers to: `shot.suffix` beside `shot.usda`, for whoever writes to make; for a package,
+    which takes them in, a folder that lasts as long as the block.
+    """
+    stem, extension = os.path.splitext(os.path.abspath(out))
+    if extension.lower() != ".usdz":
+        yield f"{stem}.{suffix}"
+        return
+    with tempfile.TemporaryDirectory(prefix="refract-") as folder:
+        yield folder

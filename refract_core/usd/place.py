@@ -47,7 +47,7 @@ def place(part: Part, placement: Placement, metres_from_stage: F64, tables: Tabl
     linear, origin = matrix[:3, :3], matrix[:3, 3]
     extra = _of_instance(part, placement, tables)
     if part.shape.is_sphere and all(values.shape[:2] == (1, 1) for values in part.primvars.values()):
-        radius = _uniform_scale(linear)
+        radius = uniform_scale(linear)
         if 0.0 < radius < _LARGEST and np.abs(origin).max() < _LARGEST:
             return Placed(part, placement, origin[None], linear, 1, extra, radius)
     # An infinite or NaN transform is told by its result.
@@ -72,11 +72,11 @@ def _sense(linear: F64) -> int:
     return 0 if abs(determinant) <= _FLAT * edges else int(math.copysign(1.0, determinant))
 
 
-def _uniform_scale(linear: F64) -> float:
-    """Scale of a matrix that only turns, mirrors and scales evenly; else 0."""
+def uniform_scale(linear: F64, tolerance: float = _ROUND) -> float:
+    """Scale of a (3, 3) matrix that only turns, mirrors and scales evenly, up to a relative `tolerance`; else 0."""
     squared = linear.T @ linear
     scale = float(np.trace(squared)) / 3.0
-    if not np.isfinite(scale) or np.abs(squared - scale * np.eye(3)).max() > _ROUND * scale:
+    if not np.isfinite(scale) or np.abs(squared - scale * np.eye(3)).max() > tolerance * scale:
         return 0.0
     return float(np.sqrt(scale))
 

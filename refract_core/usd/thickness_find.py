@@ -16,6 +16,7 @@ from .convert_find import editable, find_glass, original
 from .geometry import Shape, read_shape
 from .materials import THICKNESS_PRIMVAR, has_api, read_material
 from .parts import Bound, bind
+from .place import uniform_scale
 from .primvars import Corners, Topology, read_primvar, spread
 from .skel import posed
 from .stage import stage_unit, time_range
@@ -240,7 +241,7 @@ def read_body(candidate: Candidate, time: Usd.TimeCode, *, wants_uv: bool) -> Bo
         normals=_normals(shape, corners, linear[0], mirrored),
         topology=shape.topology,
         mirrored=mirrored,
-        radius=_uniform_scale(linear[0]) if shape.is_sphere else 0.0,
+        radius=uniform_scale(linear[0], SAME_SIZE) if shape.is_sphere else 0.0,
         uv=uv,
         uv_name=uv_name,
         notes=(*_notes(shape, candidate.prim), *(notice.text for notice in notices)),
@@ -270,13 +271,6 @@ def _several_sizes(linear: F64) -> str:
         f"its {len(linear)} instances have different sizes, from {scales.min():.3g} to {scales.max():.3g} times the "
         "prim's own; one thickness would not fit all"
     )
-
-
-def _uniform_scale(linear: F64) -> float:
-    """Scale of a matrix that only turns, mirrors and scales evenly; else 0."""
-    gram = linear.T @ linear
-    squared = float(np.trace(gram)) / 3.0
-    return float(np.sqrt(squared)) if np.abs(gram - squared * np.eye(3)).max() <= SAME_SIZE * squared else 0.0
 
 
 def _flaw(shape: Shape) -> str:
