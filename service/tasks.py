@@ -24,7 +24,10 @@ from .problems import Problem
 Say = Callable[..., None]
 """Tells the server something: `say(progress=0.5, stage="image")`, `say(path=..., warning=...)`."""
 
-_QUOTES = r"\(recompos[^)]*\)| -- .*|\b(?:syntax|parse) error.*|\(line .*|\S*pxrInternal.*"
+_QUOTES = (
+    r"(?<= gave up): .*|\S*:\d+:\d+: .*|\(recompos[^)]*\)| -- .*|\b(?:syntax|parse) error.*|\(line .*|"
+    r"\S*pxrInternal.*"
+)
 """Where USD's messages begin to quote files, or its own source."""
 _UNITS = ("Z", "thickness", "path_length", "layers")
 """Planes that are not between 0 and 1: their PNG is scaled, and says by how much."""

@@ -18,7 +18,7 @@ from service_stages import HEAD, escapes, referring
 from refract_core.aovs import AOVS
 from refract_core.errors import UsageError
 from refract_core.settings import MODELS, PURPOSES, SCREEN_METHODS, TIERS, RenderSettings
-from service import confine, models, precheck, problems
+from service import confine, models, precheck, problems, tasks
 from service.app import Settings, create_app
 from service.bodies import check, parse
 from service.digests import engine
@@ -324,3 +324,14 @@ def test_the_engine_has_one_name() -> None:
     assert engine() == engine()
     assert {kind.status for kind in problems.KINDS.values()} >= {400, 401, 404, 405, 413, 415, 422, 429, 500, 503}
     assert socket.AF_UNIX  # workers are spoken to through such sockets
+
+
+@pytest.mark.parametrize("text", [
+    "USD's own validators gave up: x.usdz[0/a.usda]:236:9: Expected } at 'def Material \"Wall\"' in </Looks>",
+    "the layer is damaged: x.usda:12:3: Unexpected token 'def Material \"Wall\"'",
+    "Could not open asset @x.usda@ for reference introduced by @y.usda@</A> -- :236:9: Expected } at 'def Material'",
+])  # fmt: skip
+def test_what_usd_quotes_from_a_file_stays_here(text: str) -> None:
+    said = tasks._public(text)
+    assert said
+    assert "Material" not in said

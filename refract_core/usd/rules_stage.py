@@ -115,7 +115,7 @@ def stock_findings(stage: Usd.Stage) -> list[Finding]:
         try:
             errors = context.Validate(stage)
         except Tf.ErrorException as error:  # damaged values, which none of them expects
-            said = " ".join(words_of(part) for part in error.args)
+            said = " ".join(dict.fromkeys(words_of(part) for part in error.args))
             return [Finding(UNREADABLE.id, ERROR, "/", f"USD's own validators gave up: {said}", "")]
     return [
         Finding(
