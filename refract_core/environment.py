@@ -29,6 +29,7 @@ LOBE_FOOTPRINT = (4.0, 1.6)
 """Footprint of a GGX lobe [rad] is the first times alpha over 1 + the second times alpha; see `prefiltered`."""
 TEXEL_LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. ITU-R BT.709
 
+I32 = np.ndarray[tuple[int, ...], np.dtype[np.int32]]
 I64 = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
 
@@ -52,6 +53,12 @@ class EnvironmentTable(NamedTuple):
     """shape (H + 1,): chance that a drawn direction lies above row i"""
     column_cdf: F64
     """shape (H, W + 1): within a row, chance that it lies before column i"""
+    row_guide: I32
+    """shape (H,): the row that chance i / H falls into, where the search for a row begins"""
+    column_guide: I32
+    """shape (H, W): the same for columns within a row"""
+    row_cosines: F64
+    """shape (H + 1,): cosine of the angle to +Y above row i"""
 
 
 def pack(environment: Environment | None) -> EnvironmentTable:
@@ -83,6 +90,9 @@ def pack(environment: Environment | None) -> EnvironmentTable:
         irradiance_poles=_pole_means(irradiance_pool.reshape(*IRRADIANCE_SHAPE, 3)),
         row_cdf=row_cdf,
         column_cdf=column_cdf,
+        row_guide=_guide(row_cdf),
+        column_guide=np.stack([_guide(cdf) for cdf in column_cdf]),
+        row_cosines=np.cos(np.linspace(0.0, math.pi, len(row_cdf))),
     )
 
 
@@ -168,6 +178,12 @@ def _distribution(pixels: F32) -> tuple[F64, F64]:
     row_cdf /= row_cdf[-1]
     column_cdf[:, -1] = 1.0
     return row_cdf, column_cdf
+
+
+def _guide(cdf: F64) -> I32:
+    """Where to begin to look for a chance (the guide table of Chen and Asau 1974): one entry for each interval."""
+    count = len(cdf) - 1
+    return (np.searchsorted(cdf, np.arange(count) / count, side="right") - 1).astype(np.int32)
 
 
 @kernel
@@ -335,26 +351,23 @@ def irradiance(table: EnvironmentTable, n: Vec) -> Vec:
 
 
 @inlined
-def _pick(cdf: F64, u: float) -> int:
-    """Index i with cdf[i] <= u < cdf[i + 1], of an interval that is not empty."""
-    low, high = 0, cdf.shape[0] - 1
-    while high - low > 1:
-        middle = (low + high) // 2
-        if cdf[middle] <= u:
-            low = middle
-        else:
-            high = middle
-    return low
+def _pick(cdf: F64, guide: I32, u: float) -> int:
+    """Index i with cdf[i] <= u < cdf[i + 1], of an interval that is not empty; two steps on average."""
+    last = guide.shape[0] - 1
+    i = int(guide[min(int(u * (last + 1)), last)])
+    while i < last and cdf[i + 1] <= u:
+        i += 1
+    return i
 
 
 @inlined
 def _texel_pdf(table: EnvironmentTable, row: int, column: int) -> float:
     """Chance per solid angle within a texel of the sampling map [1/sr]."""
-    rows, columns = table.column_cdf.shape[0], table.column_cdf.shape[1] - 1
+    columns = table.column_cdf.shape[1] - 1
     chance = (table.row_cdf[row + 1] - table.row_cdf[row]) * (
         table.column_cdf[row, column + 1] - table.column_cdf[row, column]
     )
-    band = math.cos(row * math.pi / rows) - math.cos((row + 1) * math.pi / rows)
+    band = table.row_cosines[row] - table.row_cosines[row + 1]
     return chance / (band * (2.0 * math.pi / columns))
 
 
@@ -370,13 +383,13 @@ def sample_direction(table: EnvironmentTable, u1: float, u2: float) -> tuple[Vec
     Returns:
         Unit world direction towards the light, and its density [1/sr], > 0.
     """
-    rows, columns = table.column_cdf.shape[0], table.column_cdf.shape[1] - 1
-    row = _pick(table.row_cdf, u1)
-    column = _pick(table.column_cdf[row], u2)
+    columns = table.column_cdf.shape[1] - 1
+    row = _pick(table.row_cdf, table.row_guide, u1)
+    column = _pick(table.column_cdf[row], table.column_guide[row], u2)
     down = (u1 - table.row_cdf[row]) / (table.row_cdf[row + 1] - table.row_cdf[row])
     low, high = table.column_cdf[row, column], table.column_cdf[row, column + 1]
     across = (u2 - low) / (high - low)
-    top, bottom = math.cos(row * math.pi / rows), math.cos((row + 1) * math.pi / rows)
+    top, bottom = table.row_cosines[row], table.row_cosines[row + 1]
     y = top + (bottom - top) * min(max(down, 0.0), 1.0)
     phi = (0.5 - (column + min(max(across, 0.0), 1.0)) / columns) * (2.0 * math.pi)
     radius = math.sqrt(max(1.0 - y * y, 0.0))

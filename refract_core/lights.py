@@ -96,14 +96,25 @@ def shadow_ray(lights, l, p, u1, u2):  # type: ignore[no-untyped-def] # noqa: E7
 
 
 @inlined
+def _angle_over_sine(x):  # type: ignore[no-untyped-def]
+    """acos(x) / sqrt(1 - x * x) for x in 0 .. 1, to 2e-9 of it (a Chebyshev fit); 1 at x = 1. A call of acos takes
+    longer than all the rest of an edge."""
+    high = 0.417678957119 + x * (-0.288407383113 + x * (0.148879882818 + x * (-0.0489339940335 + x * 0.00749277964118)))
+    low = -0.666178023673 + x * (0.584830373392 + x * (-0.511528240613 + x * high))
+    return 1.57079632399 + x * (-0.999999294862 + x * (0.785368621349 + x * low))
+
+
+@inlined
 def _polygon_edge(a, b, n):  # type: ignore[no-untyped-def]
     """One edge of Lambert's formula for two unit directions and the receiver's normal."""
     cosine = min(1.0, max(-1.0, dot(a, b)))
     axis = cross(a, b)
+    across = dot(axis, n)
+    angle = _angle_over_sine(abs(cosine))
+    if cosine >= 0.0:
+        return angle * across
     sine = length(axis)
-    if sine < 1e-9:
-        return 0.0
-    return math.acos(cosine) * dot(axis, n) / sine
+    return (math.pi / sine - angle) * across if sine > 1e-9 else 0.0
 
 
 @inlined

@@ -336,3 +336,22 @@ def test_wrong_arrays_are_refused_by_name() -> None:
         env.pack(Environment(np.zeros((0, 8, 3), np.float32)))
     with pytest.raises(SceneError, match=r"environment\.dome_from_world"):
         env.pack(Environment(np.zeros((4, 8, 3), np.float32), np.full((3, 3), np.nan)))
+
+
+@kernel
+def _picks(cdf: F64, guide: NDArray[np.int32], chances: F64, out: NDArray[np.int64]) -> None:
+    for i in range(len(chances)):
+        out[i] = env._pick(cdf, guide, chances[i])
+
+
+@pytest.mark.parametrize(
+    "weights", [[1.0], [1.0, 1.0, 2.0], [0.0, 3.0, 0.0, 0.0, 1.0, 0.0], [1e-9] * 40 + [1.0] + [1e-9] * 40]
+)
+def test_a_guided_search_finds_the_interval(weights: list[float]) -> None:
+    cdf = np.concatenate([[0.0], np.cumsum(weights)])
+    cdf /= cdf[-1]
+    chances = np.concatenate([np.random.default_rng(7).random(2000), cdf[cdf < 1.0], [0.0, np.nextafter(1.0, 0.0)]])
+    found = np.empty(len(chances), np.int64)
+    _picks(cdf, env._guide(cdf), chances, found)
+    assert (cdf[found] <= chances).all()
+    assert (chances < cdf[found + 1]).all()

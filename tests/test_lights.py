@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scenes import box, camera, draw, light, material, quad, scene
 
 from refract_core.kernel import kernel
-from refract_core.lights import irradiance_factor, pack_lights
+from refract_core.lights import _angle_over_sine, irradiance_factor, pack_lights
 from refract_core.pointer import Pointer
 from refract_core.scene import Light, LightKind, Mesh, Model, Scene
 
@@ -221,3 +221,16 @@ def test_the_camera_light_shows_facing_surfaces_at_their_albedo(albedo: float) -
     cosine = to_eye[..., 2] / np.linalg.norm(to_eye, axis=-1)
     np.testing.assert_allclose(planes["beauty"][..., 0], albedo * cosine, rtol=1e-4)
     assert planes["beauty"][16, 16, 0] == pytest.approx(albedo, rel=1e-4)
+
+
+@kernel
+def _angles(cosines: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+    for i in range(len(cosines)):
+        out[i] = _angle_over_sine(cosines[i])
+
+
+def test_an_angle_over_its_sine() -> None:
+    angles = np.linspace(1e-4, math.pi / 2.0, 5001)
+    found = np.empty_like(angles)
+    _angles(np.cos(angles), found)
+    assert found == pytest.approx(angles / np.sin(angles), rel=1e-8)
