@@ -29,7 +29,7 @@ LOBE_FOOTPRINT = (4.0, 1.6)
 """Footprint of a GGX lobe [rad] is the first times alpha over 1 + the second times alpha; see `prefiltered`."""
 TEXEL_LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. ITU-R BT.709
 
-I32 = np.ndarray[tuple[int, ...], np.dtype[np.int32]]
+I16 = np.ndarray[tuple[int, ...], np.dtype[np.int16]]
 I64 = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
 
@@ -51,12 +51,12 @@ class EnvironmentTable(NamedTuple):
     """shape (2, 3)"""
     row_cdf: F64
     """shape (H + 1,): chance that a drawn direction lies above row i"""
-    column_cdf: F64
-    """shape (H, W + 1): within a row, chance that it lies before column i"""
-    row_guide: I32
-    """shape (H,): the row that chance i / H falls into, where the search for a row begins"""
-    column_guide: I32
-    """shape (H, W): the same for columns within a row"""
+    column_cdf: F32
+    """shape (H, W + 1): within a row, chance that it lies before column i; small, as it is read at random"""
+    row_guide: I16
+    """shape (G,): the row that chance i / G falls into, where the search for a row begins"""
+    column_guide: I16
+    """shape (H, G): the same for columns within a row"""
     row_cosines: F64
     """shape (H + 1,): cosine of the angle to +Y above row i"""
 
@@ -157,7 +157,7 @@ def _directions(height: int, width: int) -> F64:
     return np.stack([x, y, z], axis=-1).reshape(-1, 3)
 
 
-def _distribution(pixels: F32) -> tuple[F64, F64]:
+def _distribution(pixels: F32) -> tuple[F64, F32]:
     """Cumulative chances of rows, and of columns within rows, for directions drawn by luminance."""
     shape = (min(pixels.shape[0], SAMPLING_SHAPE[0]), min(pixels.shape[1], SAMPLING_SHAPE[1]))
     small = np.empty((*shape, 3), np.float32)
@@ -177,13 +177,13 @@ def _distribution(pixels: F32) -> tuple[F64, F64]:
     column_cdf /= rows[:, None]
     row_cdf /= row_cdf[-1]
     column_cdf[:, -1] = 1.0
-    return row_cdf, column_cdf
+    return row_cdf, column_cdf.astype(np.float32)
 
 
-def _guide(cdf: F64) -> I32:
-    """Where to begin to look for a chance (the guide table of Chen and Asau 1974): one entry for each interval."""
-    count = len(cdf) - 1
-    return (np.searchsorted(cdf, np.arange(count) / count, side="right") - 1).astype(np.int32)
+def _guide(cdf: F32 | F64) -> I16:
+    """Where to begin to look for a chance (the guide table of Chen and Asau 1974): an entry for four intervals."""
+    count = max((len(cdf) - 1) // 4, 1)
+    return (np.searchsorted(cdf, np.arange(count) / count, side="right") - 1).astype(np.int16)
 
 
 @kernel
@@ -251,7 +251,7 @@ def _convolve(source: F32, lights: F64, normals: F64, out: F32) -> None:
 def _position(table: EnvironmentTable, d: Vec) -> tuple[float, float]:
     """u in 0 .. 1 and v in 0 .. 1 of a world direction of any length."""
     x, y, z = transform_direction(table.dome_from_world, d)
-    return 0.5 - math.atan2(x, z) / (2.0 * math.pi), math.atan2(math.hypot(x, z), y) / math.pi
+    return 0.5 - math.atan2(x, z) / (2.0 * math.pi), math.atan2(math.sqrt(x * x + z * z), y) / math.pi
 
 
 @inlined
@@ -351,10 +351,10 @@ def irradiance(table: EnvironmentTable, n: Vec) -> Vec:
 
 
 @inlined
-def _pick(cdf: F64, guide: I32, u: float) -> int:
-    """Index i with cdf[i] <= u < cdf[i + 1], of an interval that is not empty; two steps on average."""
-    last = guide.shape[0] - 1
-    i = int(guide[min(int(u * (last + 1)), last)])
+def _pick(cdf: F32 | F64, guide: I16, u: float) -> int:
+    """Index i with cdf[i] <= u < cdf[i + 1], of an interval that is not empty; some steps on average."""
+    cells, last = guide.shape[0], cdf.shape[0] - 2
+    i = int(guide[min(int(u * cells), cells - 1)])
     while i < last and cdf[i + 1] <= u:
         i += 1
     return i

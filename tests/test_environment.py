@@ -339,7 +339,7 @@ def test_wrong_arrays_are_refused_by_name() -> None:
 
 
 @kernel
-def _picks(cdf: F64, guide: NDArray[np.int32], chances: F64, out: NDArray[np.int64]) -> None:
+def _picks(cdf: F64, guide: NDArray[np.int16], chances: F64, out: NDArray[np.int64]) -> None:
     for i in range(len(chances)):
         out[i] = env._pick(cdf, guide, chances[i])
 
