@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .errors import SceneError
+from .inversion import I16, guide_of, pick
 from .kernel import inlined, kernel
 from .scene import F32, F64, Environment
 from .vec import Vec, transform_direction
@@ -29,7 +30,6 @@ LOBE_FOOTPRINT = (4.0, 1.6)
 """Footprint of a GGX lobe [rad] is the first times alpha over 1 + the second times alpha; see `prefiltered`."""
 TEXEL_LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. ITU-R BT.709
 
-I16 = np.ndarray[tuple[int, ...], np.dtype[np.int16]]
 I64 = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
 
@@ -90,8 +90,8 @@ def pack(environment: Environment | None) -> EnvironmentTable:
         irradiance_poles=_pole_means(irradiance_pool.reshape(*IRRADIANCE_SHAPE, 3)),
         row_cdf=row_cdf,
         column_cdf=column_cdf,
-        row_guide=_guide(row_cdf),
-        column_guide=np.stack([_guide(cdf) for cdf in column_cdf]),
+        row_guide=guide_of(row_cdf),
+        column_guide=np.stack([guide_of(cdf) for cdf in column_cdf]),
         row_cosines=np.cos(np.linspace(0.0, math.pi, len(row_cdf))),
     )
 
@@ -178,12 +178,6 @@ def _distribution(pixels: F32) -> tuple[F64, F32]:
     row_cdf /= row_cdf[-1]
     column_cdf[:, -1] = 1.0
     return row_cdf, column_cdf.astype(np.float32)
-
-
-def _guide(cdf: F32 | F64) -> I16:
-    """Where to begin to look for a chance (the guide table of Chen and Asau 1974): an entry for four intervals."""
-    count = max((len(cdf) - 1) // 4, 1)
-    return (np.searchsorted(cdf, np.arange(count) / count, side="right") - 1).astype(np.int16)
 
 
 @kernel
@@ -351,16 +345,6 @@ def irradiance(table: EnvironmentTable, n: Vec) -> Vec:
 
 
 @inlined
-def _pick(cdf: F32 | F64, guide: I16, u: float) -> int:
-    """Index i with cdf[i] <= u < cdf[i + 1], of an interval that is not empty; some steps on average."""
-    cells, last = guide.shape[0], cdf.shape[0] - 2
-    i = int(guide[min(int(u * cells), cells - 1)])
-    while i < last and cdf[i + 1] <= u:
-        i += 1
-    return i
-
-
-@inlined
 def _texel_pdf(table: EnvironmentTable, row: int, column: int) -> float:
     """Chance per solid angle within a texel of the sampling map [1/sr]."""
     columns = table.column_cdf.shape[1] - 1
@@ -384,8 +368,8 @@ def sample_direction(table: EnvironmentTable, u1: float, u2: float) -> tuple[Vec
         Unit world direction towards the light, and its density [1/sr], > 0.
     """
     columns = table.column_cdf.shape[1] - 1
-    row = _pick(table.row_cdf, table.row_guide, u1)
-    column = _pick(table.column_cdf[row], table.column_guide[row], u2)
+    row = pick(table.row_cdf, table.row_guide, u1)
+    column = pick(table.column_cdf[row], table.column_guide[row], u2)
     down = (u1 - table.row_cdf[row]) / (table.row_cdf[row + 1] - table.row_cdf[row])
     low, high = table.column_cdf[row, column], table.column_cdf[row, column + 1]
     across = (u2 - low) / (high - low)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from refract_core import environment as env
 from refract_core.errors import SceneError
+from refract_core.inversion import guide_of, pick
 from refract_core.kernel import kernel
 from refract_core.scene import F32, F64, Environment
 
@@ -341,7 +342,7 @@ def test_wrong_arrays_are_refused_by_name() -> None:
 @kernel
 def _picks(cdf: F64, guide: NDArray[np.int16], chances: F64, out: NDArray[np.int64]) -> None:
     for i in range(len(chances)):
-        out[i] = env._pick(cdf, guide, chances[i])
+        out[i] = pick(cdf, guide, chances[i])
 
 
 @pytest.mark.parametrize(
@@ -352,6 +353,6 @@ def test_a_guided_search_finds_the_interval(weights: list[float]) -> None:
     cdf /= cdf[-1]
     chances = np.concatenate([np.random.default_rng(7).random(2000), cdf[cdf < 1.0], [0.0, np.nextafter(1.0, 0.0)]])
     found = np.empty(len(chances), np.int64)
-    _picks(cdf, env._guide(cdf), chances, found)
+    _picks(cdf, guide_of(cdf), chances, found)
     assert (cdf[found] <= chances).all()
     assert (chances < cdf[found + 1]).all()

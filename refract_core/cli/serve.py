@@ -99,7 +99,7 @@ def serve(
 
         settings = Settings(
             stage_root=stage_root, data=data, executor=executor, queue=queue, tokens=_tokens(token_file), limits=chosen,
-            workers=workers or (_SENT if executor else os.cpu_count() or 1),
+            workers=workers if workers is not None else _SENT if executor else os.cpu_count() or 1,
         )  # fmt: skip
         run(settings, host, port)
 
