@@ -22,7 +22,7 @@ from refract_core.executors import CONNECT_SECONDS, nobody_at, scheduler_of, sil
 
 from . import cluster_worker
 from .cluster_worker import Ended, Order
-from .digests import engine, tree_digest
+from .digests import engine, file_digest, tree_digest
 from .gather import files_of
 from .pool import Worker
 from .problems import Problem
@@ -261,11 +261,7 @@ def _key(order: Order) -> str:
 
 
 def _hashed(root: Path, paths: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
-    found = []
-    for path in paths:
-        with open(root / path, "rb") as file:
-            found.append((path, hashlib.file_digest(file, "sha256").hexdigest()))
-    return tuple(found)
+    return tuple((path, file_digest(root / path)) for path in paths)
 
 
 def _read(root: Path, files: tuple[tuple[str, str], ...]) -> dict[str, bytes]:

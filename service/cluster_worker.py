@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hashlib
 import os
 import shutil
 import stat
@@ -22,7 +21,7 @@ from typing import Any, NamedTuple, TypeVar
 from refract_core.errors import RefractError
 from refract_core.executors import desk
 
-from .digests import engine
+from .digests import engine, file_digest
 from .pool import Nursery
 from .store import RESULTS, make_work
 
@@ -107,13 +106,9 @@ def perform(order: Order, content: Mapping[str, bytes] | None) -> Ended | None:
 
 def _are_here(root: str, files: tuple[tuple[str, str], ...]) -> bool:
     try:
-        for path, digest in files:
-            with open(os.path.join(root, path), "rb") as file:
-                if hashlib.file_digest(file, "sha256").hexdigest() != digest:
-                    return False
+        return all(file_digest(Path(root, path)) == digest for path, digest in files)
     except OSError:
         return False
-    return True
 
 
 def _put(folder: Path, content: Mapping[str, bytes]) -> None:
