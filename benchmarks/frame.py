@@ -21,14 +21,14 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import refract_core as rc
-from refract_core.camera import image_size, view_of
-from refract_core.embree import EVERYTHING, LANES, T_FAR, clear, intersect
-from refract_core.gbuffer import add_view_ray
-from refract_core.kernel import kernel
-from refract_core.pointer import Pointer
-from refract_core.render import tiles_of
-from refract_core.scratch import scratch
-from refract_core.tables import pack_geometry
+from refract_core.kernels.compile import kernel
+from refract_core.kernels.pointer import Pointer
+from refract_core.rendering.picture import tiles_of
+from refract_core.transport.scratch import scratch
+from refract_core.view.camera import image_size, view_of
+from refract_core.view.gbuffer import add_view_ray
+from refract_core.world.embree import EVERYTHING, LANES, T_FAR, clear, intersect
+from refract_core.world.tables import pack_geometry
 
 DEFAULT_STAGE = Path(__file__).parents[1] / "usd_samples" / "good" / "glass_behind_glass.usda"
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import refract_core as rc
-from refract_core.optics_scalar import transmitted_roughness
+from refract_core.optics.interface import transmitted_roughness
 from refract_core.scene import Camera, Environment, Material, Mesh, Model, Probe, Scene, Volume
 
 from .lobe import edge_half_width, median_slope, slab, straight, through_interface

@@ -27,8 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import refract_core as rc
-from refract_core.compare import displayed, flip, psnr
 from refract_core.scene import F32, Volume
+from refract_core.verbs.compare import displayed, flip, psnr
 
 from .room import ROOM, SHAPES, Shape, box_volume, probe, room, sphere_volume
 

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import refract_core as rc
-from refract_core.bake import BakeOrder, bake_probes
-from refract_core.cubemaps import arrange
-from refract_core.image import display, read_texture, write_cubemap, write_frame
+from refract_core.images.cubemaps import arrange
+from refract_core.images.pictures import display, read_texture, write_cubemap, write_frame
+from refract_core.images.srgb import srgb_encode
 from refract_core.progress import Report
-from refract_core.render import capture_probes
+from refract_core.rendering.picture import capture_probes
 from refract_core.scene import Cubemap
-from refract_core.srgb import srgb_encode
+from refract_core.verbs.bake_probes import BakeOrder, bake_probes
 
 RGB = NDArray[np.float32]
 """shape (H, W, 3), as it is shown, 0 .. 1"""

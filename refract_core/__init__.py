@@ -11,20 +11,18 @@ Names are loaded when first used: importing the package alone loads neither USD 
 from __future__ import annotations
 
 import importlib
-import sys
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from .version import __version__
 
 if TYPE_CHECKING:
     from .errors import Cancelled, EmbreeError, ImageError, RefractError, SceneError, StageError, UsageError
-    from .frame import Frame
-    from .override import OverrideError, override
-    from .render import render
+    from .images.frame import Frame
+    from .rendering.picture import render
     from .scene import Notice, Scene
     from .settings import RenderSettings
     from .usd.stage import load_stage
+    from .verbs.override import OverrideError, override
 
 __all__ = [
     "Cancelled",
@@ -48,10 +46,10 @@ __all__ = [
 _ROOMS = {
     "Cancelled": "errors",
     "EmbreeError": "errors",
-    "Frame": "frame",
+    "Frame": "images.frame",
     "ImageError": "errors",
     "Notice": "scene",
-    "OverrideError": "override",
+    "OverrideError": "verbs.override",
     "RefractError": "errors",
     "RenderSettings": "settings",
     "Scene": "scene",
@@ -59,8 +57,8 @@ _ROOMS = {
     "StageError": "errors",
     "UsageError": "errors",
     "load_stage": "usd.stage",
-    "override": "override",
-    "render": "render",
+    "override": "verbs.override",
+    "render": "rendering.picture",
 }
 
 
@@ -75,15 +73,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
-
-
-class _Package(ModuleType):
-    """A package where `render` and `override` stay functions, although modules of those names are imported too."""
-
-    def __setattr__(self, name: str, value: object) -> None:
-        if name in _ROOMS and isinstance(value, ModuleType):
-            return
-        super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package

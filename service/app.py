@@ -19,7 +19,7 @@ from starlette.exceptions import HTTPException as StarletteHTTPException
 from starlette.routing import Match
 
 from refract_core.errors import UsageError
-from refract_core.executors import scheduler_of
+from refract_core.verbs.executors import scheduler_of
 from refract_core.version import __version__
 
 from . import openapi, pages, routes

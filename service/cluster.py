@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from refract_core.errors import RefractError
-from refract_core.executors import CONNECT_SECONDS, nobody_at, scheduler_of, silent
+from refract_core.verbs.executors import CONNECT_SECONDS, nobody_at, scheduler_of, silent
 
 from . import cluster_worker
 from .cluster_worker import Ended, Order

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from refract_core.errors import RefractError
-from refract_core.executors import desk
+from refract_core.verbs.executors import desk
 
 from .digests import engine, file_digest
 from .pool import Nursery

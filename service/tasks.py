@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from refract_core.aovs import AOVS
 from refract_core.errors import EmbreeError, ImageError, RefractError, SceneError, StageError, UsageError
-from refract_core.override import OverrideError, Overrides, override, override_notes
+from refract_core.images.aovs import AOVS
 from refract_core.scene import Notice, Scene
+from refract_core.verbs.override import OverrideError, Overrides, override, override_notes
 
 from .problems import Problem
 
@@ -41,7 +41,7 @@ def perform(kind: str, stage: str, out: str, settings: Mapping[str, Any], limits
     Raises:
         Problem: for the client.
     """
-    from refract_core import image_files
+    from refract_core.images import files as image_files
 
     image_files.MAX_TEXTURE_PIXELS = min(image_files.MAX_TEXTURE_PIXELS, limits["texture_pixels"])
     try:
@@ -87,11 +87,11 @@ def _tell(notices: tuple[Notice, ...] | list[Notice], say: Say, limits: Mapping[
 
 
 def _render(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[str, int], say: Say) -> Any:
-    from refract_core.camera import image_size
-    from refract_core.render import choose_camera, render
+    from refract_core.rendering.picture import choose_camera, render
     from refract_core.settings import RenderSettings
     from refract_core.usd.settings import read_settings
     from refract_core.usd.stage import open_stage, scene_from_stage
+    from refract_core.view.camera import image_size
 
     say(progress=0.0, stage="reading the stage")
     opened = open_stage(stage)
@@ -177,7 +177,7 @@ def _inspect(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[
 
 
 def _validate(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[str, int], say: Say) -> Any:
-    from refract_core import validate as room
+    from refract_core.verbs import validate as room
 
     verdict = room.validate(room.ValidateOrder(stage=stage))
     _write(out, _clean(json.loads(room.to_json(verdict))))
@@ -185,7 +185,7 @@ def _validate(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping
 
 
 def _convert(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[str, int], say: Say) -> Any:
-    from refract_core.convert import ConvertOrder, convert
+    from refract_core.verbs.convert import ConvertOrder, convert
 
     order = ConvertOrder(
         stage=stage, out=os.path.join(out, "converted.usdz"), flatten=bool(settings.get("flatten")),

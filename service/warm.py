@@ -21,7 +21,7 @@ def draw(screens: tuple[str, ...] = ("march", "proxy")) -> None:
     Args:
         screens: methods of the screen tier to draw with, one after the other.
     """
-    from refract_core.render import render
+    from refract_core.rendering.picture import render
     from refract_core.settings import RenderSettings
     from refract_core.usd.stage import load_stage
 

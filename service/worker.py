@@ -68,11 +68,6 @@ def _warm() -> int:
     """Load everything. Returns the number of threads there are then; above 1, a fork would not be safe."""
     cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(cores)})  # Embree starts a thread for every further core it sees
-    import refract_core.convert
-    import refract_core.inspect
-    import refract_core.usd.inspect
-    import refract_core.usd.rules_stage
-    import refract_core.usd.stage  # noqa: F401
     import schemas
 
     from . import precheck, tasks, warm  # noqa: F401  the first is needed once USD is open
@@ -192,7 +187,7 @@ def _perform(job: dict[str, Any], say: Any) -> Any:
 
 def own_files() -> list[str]:
     """What the program itself is made of, and nothing else of the machine."""
-    from refract_core.kernel import cache_root
+    from refract_core.kernels.compile import cache_root
 
     here = Path(__file__).resolve().parents[1]
     own = [str(here / name) for name in ("refract_core", "schemas", "service")]

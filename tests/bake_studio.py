@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from pxr import Usd
 
-from refract_core.bake import BakeOrder, bake_probes
 from refract_core.progress import Report
 from refract_core.scene import CUBE_LEVELS, Cubemap, Probe, Scene
 from refract_core.usd.stage import load_stage
+from refract_core.verbs.bake_probes import BakeOrder, bake_probes
 
 STAGE = """#usda 1.0
 (

@@ -7,7 +7,7 @@ from typing import Any
 
 from pxr import Ar, Sdf, Usd
 
-from refract_core.usd.write import check_out, overlay, save
+from refract_core.usd.layers.write import check_out, overlay, save
 
 EXTENSIONS = (".usda", ".usdc", ".usd", ".usdz")
 

@@ -9,7 +9,7 @@ import OpenImageIO as oiio
 from pxr import Usd, UsdShade
 
 from refract_core.scene import Material, Notice, Param, Source, Texture
-from refract_core.usd.materials import read_material
+from refract_core.usd.materials.read import read_material
 
 HEADER = "#usda 1.0\n"
 

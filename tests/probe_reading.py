@@ -7,8 +7,8 @@ from pxr import Usd
 
 from refract_core.errors import ImageError
 from refract_core.scene import F64, Cubemap, Notice, Probe
-from refract_core.usd.probe_pictures import ReadCubemap
-from refract_core.usd.probes import read_probes
+from refract_core.usd.probes.pictures import ReadCubemap
+from refract_core.usd.probes.read import read_probes
 
 # Z-up stage to Y-up engine: +X stays, +Z becomes +Y.
 Y_UP = np.eye(4)

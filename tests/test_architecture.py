@@ -19,14 +19,14 @@ MAX_LINES = 400
 # Library -> the only places that may import it, as the start of a module's name.
 ROOMS = {
     "pxr": ("refract_core.usd", "schemas", "service.precheck"),
-    "embreex": ("refract_core.embree",),
-    "ctypes": ("refract_core.embree", "service"),
-    "llvmlite": ("refract_core.embree", "refract_core.kernel", "refract_core.pointer"),
-    "OpenImageIO": ("refract_core.image", "refract_core.image_files", "refract_core.image_cubemaps"),
-    "pygltflib": ("refract_core.gltf",),
-    "flip_evaluator": ("refract_core.compare",),
-    "distributed": ("refract_core.executors", "service.cluster", "service.cluster_worker"),
-    "dask": ("refract_core.executors",),
+    "embreex": ("refract_core.world.embree",),
+    "ctypes": ("refract_core.world.embree", "service"),
+    "llvmlite": ("refract_core.world.embree", "refract_core.kernels.compile", "refract_core.kernels.pointer"),
+    "OpenImageIO": ("refract_core.images.pictures", "refract_core.images.files", "refract_core.images.cubemap_files"),
+    "pygltflib": ("refract_core.usd.convert.gltf_file",),
+    "flip_evaluator": ("refract_core.verbs.compare",),
+    "distributed": ("refract_core.verbs.executors", "service.cluster", "service.cluster_worker"),
+    "dask": ("refract_core.verbs.executors",),
     "fastapi": ("service",),
     "starlette": ("service",),
     "uvicorn": ("service",),
@@ -114,7 +114,7 @@ def test_the_walk_sees_what_is_there() -> None:
     assert Import("refract_core.settings", "refract_core.errors", True) in imports()
     assert Import("schemas", "pxr", False) in imports()
     assert any(row.importer.startswith("refract_core.usd.") and row.imported == "pxr" for row in imports())
-    assert any(row.importer == "refract_core.vec" and row.imported == "refract_core.kernel" for row in imports())
+    assert any(row.importer == "refract_core.kernels.vec" and row.imported == "refract_core.kernels.compile" for row in imports())
 
 
 @pytest.mark.parametrize("library", ROOMS)

@@ -11,15 +11,15 @@ import pytest
 from bake_studio import LEFT, RIGHT, Studio, probe_of, studio_in
 from typer.testing import CliRunner
 
-from refract_core import bake
-from refract_core.bake import stale_bakes
-from refract_core.bake_files import Task, batches
 from refract_core.cli import app
-from refract_core.digest import probe_digest
 from refract_core.errors import Cancelled, ImageError, StageError
-from refract_core.image import read_notes
+from refract_core.images.bake_files import Task, batches
+from refract_core.images.pictures import read_notes
+from refract_core.probes.digest import probe_digest
 from refract_core.scene import Bake, Scene
 from refract_core.usd.stage import load_stage
+from refract_core.verbs import bake_probes as bake
+from refract_core.verbs.bake_probes import stale_bakes
 from refract_core.version import __version__
 
 
@@ -32,7 +32,7 @@ def studio(tmp_path: Path) -> Studio:
 
 
 def test_cancel_leaves_out_as_it_was_and_the_next_run_goes_on(studio: Studio, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("refract_core.bake_files._BATCH", 1)
+    monkeypatch.setattr("refract_core.images.bake_files._BATCH", 1)
 
     def stop() -> None:
         studio.cancelled = len(studio.captured) == 1

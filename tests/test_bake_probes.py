@@ -11,14 +11,14 @@ import pytest
 from bake_studio import LEFT, RIGHT, STAGE, Studio, grey, probe_of, studio_in
 from pxr import Sdf
 
-from refract_core import bake
-from refract_core.bake import BakeOrder, bake_probes, stale_bake
-from refract_core.bake_files import file_names
-from refract_core.digest import probe_digest
 from refract_core.errors import UsageError
-from refract_core.image import read_cubemap, read_notes
+from refract_core.images.bake_files import file_names
+from refract_core.images.pictures import read_cubemap, read_notes
+from refract_core.probes.digest import probe_digest
 from refract_core.scene import CUBE_LEVELS
 from refract_core.usd.stage import load_stage
+from refract_core.verbs import bake_probes as bake
+from refract_core.verbs.bake_probes import BakeOrder, bake_probes, stale_bake
 from refract_core.version import __version__
 
 

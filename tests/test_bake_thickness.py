@@ -13,13 +13,13 @@ from test_thickness import ball, both, box, torus
 from thickness_stages import NAME, bind, drawn, from_picture, glass, mapped, mesh, metres, new, run, scaled, unwrapped
 from typer.testing import CliRunner
 
-from refract_core.bake_thickness import ThicknessOrder, bake_over, bake_thickness
 from refract_core.cli import app
 from refract_core.errors import Cancelled, UsageError
 from refract_core.progress import Report
 from refract_core.scene import Param
+from refract_core.usd.layers.write import overlay
 from refract_core.usd.stage import load_stage
-from refract_core.usd.write import overlay
+from refract_core.verbs.bake_thickness import ThicknessOrder, bake_over, bake_thickness
 
 # --- primvars -------------------------------------------------------------------------------------------------------
 

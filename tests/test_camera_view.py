@@ -9,12 +9,12 @@ import pytest
 from numpy.typing import NDArray
 from scenes import camera, view_rays
 
-from refract_core.camera import View, image_size, pixel_point, pixel_ray, project, view_of
 from refract_core.errors import UsageError
-from refract_core.kernel import kernel
-from refract_core.pointer import Pointer
-from refract_core.sampling import pixel_offset
+from refract_core.kernels.compile import kernel
+from refract_core.kernels.pointer import Pointer
+from refract_core.kernels.sampling import pixel_offset
 from refract_core.scene import Camera
+from refract_core.view.camera import View, image_size, pixel_point, pixel_ray, project, view_of
 
 F64 = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 import refract_core as rc
 from refract_core.cli import app
 from refract_core.errors import Cancelled, SceneError, UsageError
-from refract_core.image import read_texture
+from refract_core.images.pictures import read_texture
 from refract_core.progress import COMPILING, reporting
 from refract_core.scene import Notice
 
@@ -74,7 +74,7 @@ def engine(monkeypatch: pytest.MonkeyPatch) -> Engine:
     monkeypatch.setattr(stage, "open_stage", engine.open_stage)
     monkeypatch.setattr(stage, "scene_from_stage", engine.scene_from_stage)
     monkeypatch.setattr(importlib.import_module("refract_core.usd.settings"), "read_settings", engine.read_settings)
-    monkeypatch.setattr(importlib.import_module("refract_core.render"), "render", engine.render)
+    monkeypatch.setattr(importlib.import_module("refract_core.rendering.picture"), "render", engine.render)
     return engine
 
 
@@ -351,7 +351,7 @@ def test_the_package_alone_loads_no_library() -> None:
 def test_every_public_name_is_there_and_render_stays_the_function() -> None:
     code = """
 import refract_core as rc
-import refract_core.render
+import refract_core.rendering.picture
 assert rc.__all__ == sorted(rc.__all__)
 for name in rc.__all__:
     getattr(rc, name)

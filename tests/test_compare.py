@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from refract_core import UsageError
-from refract_core.compare import displayed, flip, flip_map, psnr
+from refract_core.verbs.compare import displayed, flip, flip_map, psnr
 
 F32 = NDArray[np.float32]
 

@@ -14,10 +14,10 @@ from pxr import Sdf, Usd, UsdShade
 from typer.testing import CliRunner
 
 from refract_core.cli import app
-from refract_core.convert import ConvertOrder, Row, convert
 from refract_core.errors import Cancelled, RefractError, StageError, UsageError
 from refract_core.scene import Material, Model, Param, Scene
 from refract_core.usd.stage import load_stage
+from refract_core.verbs.convert import ConvertOrder, Row, convert
 
 HEAD = '#usda 1.0\n(\n    defaultPrim = "W"\n    metersPerUnit = {unit}\n    upAxis = "Z"\n)\n'
 BOUND = '(prepend apiSchemas = ["MaterialBindingAPI"])'

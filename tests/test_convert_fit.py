@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from refract_core.fit import Fit, alike, fit, together
 from refract_core.scene import Model
-from refract_core.usd.gprims import Solid, _unit_cube, _unit_plane, _unit_tapered, unit_sphere
+from refract_core.thickness.fit import Fit, alike, fit, together
+from refract_core.usd.geometry.gprims import Solid, _unit_cube, _unit_plane, _unit_tapered, unit_sphere
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from test_convert import material, plain, run
 
 from refract_core.errors import StageError, UsageError
-from refract_core.gltf import read_gltf
 from refract_core.scene import Mesh, Model, Param
-from refract_core.usd.gprims import Solid, _unit_cube, _unit_plane, unit_sphere
+from refract_core.usd.convert.gltf_file import read_gltf
+from refract_core.usd.geometry.gprims import Solid, _unit_cube, _unit_plane, unit_sphere
 from refract_core.usd.stage import load_stage
 
 pytest.importorskip("pygltflib")

@@ -10,9 +10,9 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from refract_core.cubemaps import LAYOUTS, arrange, face_directions, faces_of, halved, latlong_directions
 from refract_core.errors import ImageError, UsageError
-from refract_core.image import read_cubemap, write_cubemap
+from refract_core.images.cubemaps import LAYOUTS, arrange, face_directions, faces_of, halved, latlong_directions
+from refract_core.images.pictures import read_cubemap, write_cubemap
 from refract_core.scene import CUBE_LEVELS, F32, F64, Cubemap
 
 AXES = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))

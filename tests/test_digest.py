@@ -11,8 +11,8 @@ import pytest
 from scenes import box, dome, glass, material, quad
 from scenes import light as light_at
 
-from refract_core import digest
-from refract_core.digest import probe_digest
+from refract_core.probes import digest
+from refract_core.probes.digest import probe_digest
 from refract_core.scene import (
     Bake,
     Cubemap,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pxr import Sdf
 
 import refract_core as rc
-from refract_core.image import read_texture
+from refract_core.images.pictures import read_texture
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from refract_core import embree
-from refract_core.embree import LANES, Bvh, Packet, Part, new_packet
 from refract_core.errors import SceneError
-from refract_core.kernel import kernel
-from refract_core.pointer import Pointer
+from refract_core.kernels.compile import kernel
+from refract_core.kernels.pointer import Pointer
+from refract_core.world import embree
+from refract_core.world.embree import LANES, Bvh, Packet, Part, new_packet
 
 F32 = NDArray[np.float32]
 

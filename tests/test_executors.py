@@ -18,13 +18,13 @@ import pytest
 from bake_studio import STAGE as PROBES
 from typer.testing import CliRunner
 
-from refract_core import executors
-from refract_core.bake import BakeOrder, bake_probes
 from refract_core.cli import app
 from refract_core.errors import Cancelled, RefractError, StageError, UsageError
-from refract_core.executors import Bench, Crew, Sent, crew_at, patience, sent_stage, spread
 from refract_core.progress import Report
-from refract_core.sequence import Order, render_files
+from refract_core.verbs import executors
+from refract_core.verbs.bake_probes import BakeOrder, bake_probes
+from refract_core.verbs.executors import Bench, Crew, Sent, crew_at, patience, sent_stage, spread
+from refract_core.verbs.render_files import Order, render_files
 
 # Dask leaves sockets and loops of its own for the garbage collector.
 pytestmark = [

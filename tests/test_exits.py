@@ -24,7 +24,7 @@ from scenes import (
     where,
 )
 
-from refract_core.optics import fresnel_dielectric, sphere_model
+from refract_core.optics.arrays import fresnel_dielectric, sphere_model
 from refract_core.scene import Camera, Mesh, Model, Sphere
 
 F64 = NDArray[np.float64]

@@ -11,7 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from refract_core.faces import (
+from refract_core.kernels.compile import kernel
+from refract_core.optics.interface import probe_roughness_hdrp
+from refract_core.probes.faces import (
     CUBE,
     TEXEL,
     Levels,
@@ -27,8 +29,6 @@ from refract_core.faces import (
     side_of,
     view_of_level,
 )
-from refract_core.kernel import kernel
-from refract_core.optics_scalar import probe_roughness_hdrp
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from refract_core.errors import UsageError
-from refract_core.usd.frames import MAX_FRAMES, frame_jobs, frame_path, parse_frames
+from refract_core.usd.time_codes import MAX_FRAMES, frame_jobs, frame_path, parse_frames
 
 
 @pytest.mark.parametrize(

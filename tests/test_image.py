@@ -18,11 +18,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from refract_core import image
-from refract_core.aovs import AOVS, shape_of
 from refract_core.errors import ImageError, SceneError, UsageError
-from refract_core.frame import Frame
-from refract_core.image import check_writable, read_texture, write_frame
+from refract_core.images import pictures as image
+from refract_core.images.aovs import AOVS, shape_of
+from refract_core.images.frame import Frame
+from refract_core.images.pictures import check_writable, read_texture, write_frame
 
 HEIGHT, WIDTH = 3, 5
 

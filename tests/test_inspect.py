@@ -14,11 +14,11 @@ from typer.testing import CliRunner, Result
 from benchmarks.big_stage import make, usd_alone
 from refract_core.cli import app
 from refract_core.errors import StageError
-from refract_core.inspect import WIDTH, inspect, to_json, to_text
-from refract_core.usd.rules_glass import glass_of
+from refract_core.usd.rules.glass import glass_of
 from refract_core.usd.stage import load_stage
-from refract_core.validate import ValidateOrder, validate
-from refract_core.validate import to_text as verdict_text
+from refract_core.verbs.inspect import WIDTH, inspect, to_json, to_text
+from refract_core.verbs.validate import ValidateOrder, validate
+from refract_core.verbs.validate import to_text as verdict_text
 
 SAMPLES = Path(__file__).parents[1] / "usd_samples"
 GOOD = sorted((SAMPLES / "good").glob("*.usda"))

@@ -11,10 +11,10 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 from scenes import box, camera, draw, light, material, quad, scene
 
-from refract_core.kernel import kernel
-from refract_core.lights import _angle_over_sine, irradiance_factor, pack_lights
-from refract_core.pointer import Pointer
+from refract_core.kernels.compile import kernel
+from refract_core.kernels.pointer import Pointer
 from refract_core.scene import Light, LightKind, Mesh, Model, Scene
+from refract_core.world.lights import _angle_over_sine, irradiance_factor, pack_lights
 
 F64 = NDArray[np.float64]
 

@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from refract_core import optics, optics_scalar
 from refract_core.errors import UsageError
+from refract_core.optics import arrays as optics
+from refract_core.optics import interface as optics_scalar
 
 F64 = NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])

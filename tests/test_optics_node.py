@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from refract_core import optics, optics_scalar
+from refract_core.optics import arrays as optics
+from refract_core.optics import interface as optics_scalar
 
 UP = np.array([0.0, 0.0, 1.0])
 UNTIMED = settings(deadline=None)  # the first example may compile

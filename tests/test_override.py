@@ -15,11 +15,11 @@ from typer.testing import CliRunner
 
 import refract_core as rc
 from refract_core.cli import app
-from refract_core.executors import Crew
-from refract_core.override import FIELDS, LENGTHS, RANGES, THIN_THICKNESS, OverrideError, override_notes
 from refract_core.progress import reporting
 from refract_core.scene import Model, Param, Source, Sphere
-from refract_core.sequence import Order, render_files
+from refract_core.verbs.executors import Crew
+from refract_core.verbs.override import FIELDS, LENGTHS, RANGES, THIN_THICKNESS, OverrideError, override_notes
+from refract_core.verbs.render_files import Order, render_files
 
 SMALL = {"image_width": 32, "samples": 1, "jobs": 1}
 STAGE = """#usda 1.0
@@ -119,7 +119,7 @@ def test_what_becomes_glass_is_clear_and_what_becomes_thin_is_thin() -> None:
     _, thin = rc.override(scene(), {"/ball": {"model": "thin", "thickness": 9, "absorptionDistance": 9}}).materials
     assert value(thin, Param.THICKNESS) == (THIN_THICKNESS,) * 3
     assert thin.absorption_distance == THIN_THICKNESS
-    assert importlib.import_module("refract_core.usd.materials").THIN_THICKNESS == THIN_THICKNESS
+    assert importlib.import_module("refract_core.usd.materials.read").THIN_THICKNESS == THIN_THICKNESS
 
 
 @pytest.mark.parametrize(
@@ -186,7 +186,7 @@ def stage(tmp_path: Path) -> Path:
 
 
 def pixels(path: Path) -> Any:
-    return importlib.import_module("refract_core.image").read_texture(str(path), name="p", color_space="raw").pixels
+    return importlib.import_module("refract_core.images.pictures").read_texture(str(path), name="p", color_space="raw").pixels
 
 
 def refract(*words: object) -> tuple[int, str]:

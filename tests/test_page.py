@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from fake_service import Job
 
-from refract_core.aovs import AOVS
+from refract_core.images.aovs import AOVS
 from refract_core.settings import MODELS, SCREEN_METHODS, TIERS, RenderSettings
 
 STATIC = Path(__file__).parents[1] / "service" / "static"

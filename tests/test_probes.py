@@ -26,10 +26,10 @@ from scenes import (
     where,
 )
 
-from refract_core.kernel import kernel
-from refract_core.plan import in_order
-from refract_core.probes import cube_at
-from refract_core.render import Session, Work, prepare
+from refract_core.kernels.compile import kernel
+from refract_core.probes.lookup import cube_at
+from refract_core.probes.plan import in_order
+from refract_core.rendering.picture import Session, Work, prepare
 from refract_core.scene import Model, Probe, Scene, Sphere, Volume
 from refract_core.settings import RenderSettings
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from refract_core.kernel import kernel
-from refract_core.reach import Reach, next_of, piece_of, reach_of
+from refract_core.kernels.compile import kernel
+from refract_core.probes.reach import Reach, next_of, piece_of, reach_of
 
 F64 = NDArray[np.float64]
 

@@ -28,7 +28,7 @@ from scenes import (
     where,
 )
 
-from refract_core.optics import fresnel_dielectric
+from refract_core.optics.arrays import fresnel_dielectric
 from refract_core.scene import Material, Mesh, Model, Probe, Scene, Sphere, Volume
 
 F32 = NDArray[np.float32]

@@ -9,7 +9,7 @@ import pytest
 from pxr import Usd, UsdGeom, UsdValidation
 
 import refract_core as rc
-from refract_core.image import read_texture
+from refract_core.images.pictures import read_texture
 
 FOLDER = Path(__file__).parents[1] / "usd_samples" / "good"
 STAGES = sorted(FOLDER.glob("*.usda"))

@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
 from scenes import camera, view_rays
 
-from refract_core.camera import view_of
-from refract_core.kernel import kernel
-from refract_core.pointer import Pointer
-from refract_core.pyramid import (
+from refract_core.kernels.compile import kernel
+from refract_core.kernels.pointer import Pointer
+from refract_core.scene import Camera
+from refract_core.view.camera import view_of
+from refract_core.view.pyramid import (
     Screen,
     blur_level,
     color_levels,
@@ -22,8 +23,7 @@ from refract_core.pyramid import (
     fill_depth_levels,
     new_screen_buffers,
 )
-from refract_core.scene import Camera
-from refract_core.screen import march
+from refract_core.view.screen import march
 
 F64 = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from pxr import Sdf, UsdUtils
 from service_server import BALL, ROOT, SMALL, Server, running, upload
 from service_stages import HEAD, escapes, laughs, mutated, nested, package, referring
 
-from refract_core.image import write_map
+from refract_core.images.pictures import write_map
 
 WAYS = [(name, "render") for name in escapes("/x/y.usda")]
 WAYS += [("absolute", verb) for verb in ("inspect", "validate", "convert")]

@@ -16,7 +16,7 @@ import pytest
 from pxr import Usd
 from service_server import BALL, ROOT, SMALL, Server, running, until, upload
 
-from refract_core.image import read_texture
+from refract_core.images.pictures import read_texture
 
 GOOD = ROOT / "usd_samples" / "good"
 JSON = b"POST /v1/render HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
@@ -49,7 +49,7 @@ def pixels_of(content: bytes) -> Any:
 
 def test_an_upload_becomes_the_picture_that_the_command_line_makes(client: httpx.Client, tmp_path: Path) -> None:
     from refract_core.progress import reporting
-    from refract_core.sequence import Order, render_files
+    from refract_core.verbs.render_files import Order, render_files
 
     answer = post(client)
     assert answer.status_code == 200
@@ -120,8 +120,8 @@ def test_overrides_change_one_material(client: httpx.Client) -> None:
 
 
 def test_inspect_and_validate_answer_as_the_command_line(client: httpx.Client, tmp_path: Path) -> None:
-    from refract_core.inspect import inspect
-    from refract_core.validate import ValidateOrder, to_json, validate
+    from refract_core.verbs.inspect import inspect
+    from refract_core.verbs.validate import ValidateOrder, to_json, validate
 
     seen = client.post("/v1/inspect", json={"stage": "marble.usda"}).json()
     assert seen == {**inspect(str(GOOD / "marble.usda")), "stage": "marble.usda"}

@@ -15,8 +15,8 @@ from pxr import UsdUtils
 from service_server import ROOT, InProcess
 from service_stages import HEAD, escapes, referring
 
-from refract_core.aovs import AOVS
 from refract_core.errors import UsageError
+from refract_core.images.aovs import AOVS
 from refract_core.settings import MODELS, PURPOSES, SCREEN_METHODS, TIERS, RenderSettings
 from service import confine, models, precheck, problems, tasks
 from service.app import Settings, create_app

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from refract_core.scene import Texture, Wrap
-from refract_core.textures import LARGEST, TextureTable, pack, sample
+from refract_core.world.textures import LARGEST, TextureTable, pack, sample
 
 CLAMP = int(Wrap.CLAMP)
 EVERY_WRAP = [int(wrap) for wrap in Wrap]

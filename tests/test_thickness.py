@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from refract_core.thickness import VIEWS, Places, corner_places, measure, mended, middle_places, views
-from refract_core.thickness_map import draw, texels
+from refract_core.thickness.measure import VIEWS, Places, corner_places, measure, mended, middle_places, views
+from refract_core.thickness.picture import draw, texels
 
 F64 = NDArray[np.float64]
 U32 = NDArray[np.uint32]

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scene_reading import CUBE, TWO_TRIANGLES, read, texts
 
-from refract_core.usd.triangulate import has_area
+from refract_core.usd.geometry.triangulate import has_area
 
 # --- bad input ------------------------------------------------------------------------------------------------------
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scene_reading import areas, read, signed_volume, texts, to_stage
 
-from refract_core.usd.triangulate import is_closed
+from refract_core.usd.geometry.triangulate import is_closed
 
 # --- gprims ---------------------------------------------------------------------------------------------------------
 

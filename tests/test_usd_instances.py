@@ -10,7 +10,7 @@ from pxr import Usd, UsdGeom
 from scene_reading import CUBE, drawn, read, texts, to_stage
 
 from refract_core.errors import StageError
-from refract_core.usd import traverse
+from refract_core.usd.geometry import traverse
 from refract_core.usd.stage import open_stage, scene_from_stage
 
 # --- instances ------------------------------------------------------------------------------------------------------

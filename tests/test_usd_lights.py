@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from pxr import Usd, UsdLux
 
 from refract_core.scene import Environment, Light, LightKind, Notice
-from refract_core.usd.domes import directions, linear, lookup
-from refract_core.usd.lights import read_lights
-from refract_core.usd.textures import read_texture
+from refract_core.usd.lights.domes import directions, linear, lookup
+from refract_core.usd.lights.read import read_lights
+from refract_core.usd.materials.textures import read_texture
 
 IDENTITY = np.eye(4)
 Read = tuple[tuple[Light, ...], Environment | None, list[Notice]]

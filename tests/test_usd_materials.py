@@ -11,7 +11,7 @@ from pxr import Usd, UsdShade
 
 from refract_core.errors import StageError
 from refract_core.scene import Model, Param, Source
-from refract_core.usd.materials import display_color_material, read_material
+from refract_core.usd.materials.read import display_color_material, read_material
 
 # --- UsdPreviewSurface ----------------------------------------------------------------------------------------------
 

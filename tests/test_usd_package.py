@@ -12,7 +12,7 @@ from layer_writing import content, opinions, package_of, stage_in, write
 from pxr import Sdf, Usd, UsdValidation
 
 from refract_core.errors import StageError
-from refract_core.usd.write import overlay, save
+from refract_core.usd.layers.write import overlay, save
 
 
 @pytest.fixture

@@ -11,10 +11,10 @@ from probe_reading import cubemap, open_text, planar, probe, read, read_one, rea
 from pxr import Sdf, Usd, UsdUtils
 
 from refract_core.errors import ImageError, StageError
-from refract_core.image import write_cubemap
+from refract_core.images.pictures import write_cubemap
 from refract_core.scene import CUBE_LEVELS, Bake, Cubemap, Notice
-from refract_core.usd import probe_pictures
-from refract_core.usd.probes import read_probes
+from refract_core.usd.probes import pictures as probe_pictures
+from refract_core.usd.probes.read import read_probes
 from refract_core.usd.stage import load_stage
 
 # ---- pictures
@@ -130,7 +130,7 @@ def decoded(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str | bytes, str, int
         given.append((source, name, resolution))
         return cubemap(name, resolution)
 
-    monkeypatch.setattr("refract_core.image.read_cubemap", decode)
+    monkeypatch.setattr("refract_core.images.pictures.read_cubemap", decode)
     return given
 
 

@@ -11,7 +11,7 @@ from pxr import Usd, UsdUtils
 
 from refract_core.errors import ImageError
 from refract_core.scene import Channel, Model, Param, Wrap
-from refract_core.usd.textures import read_texture
+from refract_core.usd.materials.textures import read_texture
 
 TEXTURED = """
     string inputs:uvName = "st1"

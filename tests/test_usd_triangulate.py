@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scene_reading import areas, solid
 
-from refract_core.usd.triangulate import fans, fans_fit, is_closed, smooth_normals, triangulate, weld
+from refract_core.usd.geometry.triangulate import fans, fans_fit, is_closed, smooth_normals, triangulate, weld
 
 Points = NDArray[np.float32]
 

@@ -13,7 +13,7 @@ from layer_writing import EXTENSIONS, content, opinions, package_of, stage_in, w
 from pxr import Sdf, Usd
 
 from refract_core.errors import StageError, UsageError
-from refract_core.usd.write import RECORD, check_out, overlay, save
+from refract_core.usd.layers.write import RECORD, check_out, overlay, save
 
 
 @pytest.fixture

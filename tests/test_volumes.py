@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from refract_core import volumes
-from refract_core.vec import Vec
+from refract_core.kernels.vec import Vec
+from refract_core.probes import volumes
 
 UNTIMED = settings(deadline=None)  # the first example compiles
 ZEROS = (0.0,) * 6

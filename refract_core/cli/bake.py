@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from ..bake import BakeOrder, bake_probes
-from ..executors import crew_at
+from ..verbs.bake_probes import BakeOrder, bake_probes
+from ..verbs.executors import crew_at
 from .app import Jobs, ProgressMode, app, outcome, words
 
 bake = typer.Typer(help="Work something out once and keep it in a layer over the stage.", no_args_is_help=True)

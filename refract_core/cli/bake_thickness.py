@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from ..bake_thickness import ThicknessOrder, bake_thickness
+from ..verbs.bake_thickness import ThicknessOrder, bake_thickness
 from .app import Jobs, ProgressMode, outcome, words
 from .bake import bake
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from ..convert import Converted, ConvertOrder, Row, convert
+from ..verbs.convert import Converted, ConvertOrder, Row, convert
 from .app import ProgressMode, app, outcome, words
 
 In = Annotated[

@@ -18,7 +18,7 @@ def inspect(stage: Stage, json: Json = False) -> None:
 
     A * after a model means that the surface shader made it glass, without RefractMaterialAPI.
     """
-    from .. import inspect as room
+    from ..verbs import inspect as room
 
     with outcome("none") as (_report, cancel):
         report = room.inspect(stage, cancel)

@@ -40,7 +40,7 @@ def node(
 
     Unity's intensity is a transmittance into denser media and a reflectance out of them; the two are also given apart.
     """
-    from .. import node as room
+    from ..verbs import node as room
 
     with outcome("none") as (report, _cancel):
         asked = room.Interface(source, medium, mode)

@@ -7,9 +7,9 @@ from typing import Annotated, Any
 import typer
 
 from ..errors import UsageError
-from ..executors import crew_at
-from ..override import COLORS, RANGES
-from ..sequence import Order, render_files
+from ..verbs.executors import crew_at
+from ..verbs.override import COLORS, RANGES
+from ..verbs.render_files import Order, render_files
 from .app import Jobs, ProgressMode, app, outcome, words
 
 Stage = Annotated[str, typer.Argument(metavar="STAGE", help="The .usd, .usda, .usdc or .usdz file to render.")]

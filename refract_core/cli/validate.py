@@ -27,7 +27,7 @@ def validate(stage: Stage, fix: Fix = "", overwrite: Overwrite = False, json: Js
 
     Exit code 1 when errors remain; warnings do not fail.
     """
-    from .. import validate as room
+    from ..verbs import validate as room
 
     with outcome("none") as (_report, cancel):
         verdict = room.validate(room.ValidateOrder(stage=stage, fix=fix, overwrite=overwrite), cancel)

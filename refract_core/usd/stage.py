@@ -19,15 +19,15 @@ import schemas
 from ..errors import StageError, UsageError
 from ..scene import F64, Mesh, Notice, Scene, Sphere
 from .camera import choose_camera, read_cameras
-from .geometry import Shape, read_shape
-from .layers import words_of
-from .lights import read_lights
-from .parts import Bound, Part, Tables, assemble, bind
-from .place import Placed, bounds_of, place, to_mesh, to_sphere
-from .probe_pictures import read_cubemap
-from .probes import read_probes
-from .skel import posed
-from .traverse import Placement, some_of, walk
+from .geometry.parts import Bound, Part, Tables, assemble, bind
+from .geometry.place import Placed, bounds_of, place, to_mesh, to_sphere
+from .geometry.shapes import Shape, read_shape
+from .geometry.skel import posed
+from .geometry.traverse import Placement, some_of, walk
+from .layers.edit import words_of
+from .lights.read import read_lights
+from .probes.pictures import read_cubemap
+from .probes.read import read_probes
 
 Keep = Callable[[list[Placement], Tables], list[Placement]]
 """Some of what is drawn."""

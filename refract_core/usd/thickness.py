@@ -14,7 +14,7 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from ..scene import F64, Notice
-from .materials import THICKNESS_PRIMVAR
+from .materials.read import THICKNESS_PRIMVAR
 from .thickness_find import Body, Coat
 
 MADE = "bake thickness"

@@ -12,16 +12,16 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from ..scene import F64, U32, Material, Model, Notice, Param, Texture
 from ..settings import PURPOSES
-from .convert_find import editable, find_glass, original
-from .geometry import Shape, read_shape
-from .materials import THICKNESS_PRIMVAR, has_api, read_material
-from .parts import Bound, bind
-from .place import uniform_scale
-from .primvars import Corners, Topology, read_primvar, spread
-from .skel import posed
+from .convert.find import editable, find_glass, original
+from .geometry.parts import Bound, bind
+from .geometry.place import uniform_scale
+from .geometry.primvars import Corners, Topology, read_primvar, spread
+from .geometry.shapes import Shape, read_shape
+from .geometry.skel import posed
+from .geometry.traverse import Placement, walk
+from .geometry.triangulate import turned_over, weld
+from .materials.read import THICKNESS_PRIMVAR, has_api, read_material
 from .stage import stage_unit, time_range
-from .traverse import Placement, walk
-from .triangulate import turned_over, weld
 
 SAME_SIZE = 1.0e-3
 """Relative difference up to which two placements have one size."""

@@ -1,0 +1,168 @@
+"""Image files as bytes and pixels: what reading and writing pictures and cubemaps share. Knows OpenImageIO."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ImageError
+
+MAX_TEXTURE_PIXELS = 1 << 28
+HALF_MAX = 65504.0
+
+_PNG_END = b"IEND\xaeB`\x82"
+_STRAIGHT_ALPHA = "oiio:UnassociatedAlpha"
+
+
+def extension_of(path: str) -> str:
+    return os.path.splitext(path)[1].lower()
+
+
+# --- reading -----------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def named_file(source: str | bytes, name: str) -> Iterator[str]:
+    """A path OpenImageIO can open: its Python binding reads no bytes."""
+    if isinstance(source, bytes):
+        with memory_file() as path:
+            Path(path).write_bytes(source)
+            yield path
+    elif os.path.isfile(source):
+        yield source
+    else:
+        raise ImageError(f"{name}: the file does not exist; correct the path or add the file")
+
+
+@contextmanager
+def memory_file() -> Iterator[str]:
+    """Path of an empty file in memory (where the system has that), which also works where nothing may be written."""
+    if hasattr(os, "memfd_create"):
+        descriptor = os.memfd_create("image")
+        try:
+            yield f"/proc/self/fd/{descriptor}"
+        finally:
+            os.close(descriptor)
+    else:
+        with tempfile.TemporaryDirectory() as folder:
+            yield os.path.join(folder, "image")
+
+
+class Pixels(NamedTuple):
+    """The first image of a file."""
+
+    rgba: NDArray[Any]
+    """shape (H, W, 4), uint8 or float32"""
+    channels: int
+    """how many the file itself has"""
+    integer: bool
+    straight: bool
+    """colours are not multiplied by alpha"""
+
+
+def read_pixels(path: str, name: str) -> Pixels:
+    """Decode the first image in a file; see `refract_core.image.read_texture`."""
+    import OpenImageIO as oiio
+
+    config = oiio.ImageSpec()
+    config.attribute(_STRAIGHT_ALPHA, 1)
+    file = oiio.ImageInput.open(path, config)
+    if file is None:
+        raise ImageError(f"{name}: not a readable image: {reason(oiio.geterror(), path)}")
+    try:
+        spec = file.spec()
+        check_size(spec, name)
+        small = spec.format.basetype in (oiio.UINT8, oiio.INT8)
+        integer = spec.format.basetype not in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+        pixels = file.read_image(0, 0, 0, spec.nchannels, oiio.UINT8 if small else oiio.FLOAT)
+        if pixels is None:
+            raise ImageError(f"{name}: damaged image: {reason(file.geterror(), path)}")
+        pixels = pixels.reshape(spec.height, spec.width, spec.nchannels)
+        straight = bool(spec.get_int_attribute(_STRAIGHT_ALPHA, 0))
+        return Pixels(_rgba(_display_window(pixels, spec), spec), spec.nchannels, integer, straight)
+    finally:
+        file.close()
+
+
+def check_size(spec: Any, name: str) -> None:
+    """Refuse, before its pixels are read, an image that is no flat picture or too large."""
+    if spec.depth > 1 or spec.nchannels < 1:
+        raise ImageError(f"{name}: a volume or an empty image cannot be a texture; give a flat picture")
+    pixel_count = max(spec.width * spec.height, spec.full_width * spec.full_height)
+    if pixel_count * max(spec.nchannels, 4) > MAX_TEXTURE_PIXELS * 4:
+        raise ImageError(
+            f"{name}: {spec.width} x {spec.height} x {spec.nchannels} channels is over {MAX_TEXTURE_PIXELS} RGBA "
+            "pixels; give a smaller image"
+        )
+
+
+def reason(message: str, path: str = "") -> str:
+    """First line of a library's message, which may be empty or long, without the path it knows."""
+    lines = (message.replace(path, "the file") if path else message).strip().splitlines()
+    return lines[0] if lines else "no reason given"
+
+
+def _display_window(pixels: NDArray[Any], spec: Any) -> NDArray[Any]:
+    """Pixels of the display window; what the data window lacks is 0 (OpenEXR, "Technical Introduction")."""
+    if (spec.x, spec.y, spec.width, spec.height) == (spec.full_x, spec.full_y, spec.full_width, spec.full_height):
+        return pixels
+    shown = np.zeros((spec.full_height, spec.full_width, spec.nchannels), pixels.dtype)
+    x, y = spec.x - spec.full_x, spec.y - spec.full_y
+    left, right = max(x, 0), min(x + spec.width, spec.full_width)
+    top, bottom = max(y, 0), min(y + spec.height, spec.full_height)
+    if left < right and top < bottom:
+        shown[top:bottom, left:right] = pixels[top - y : bottom - y, left - x : right - x]
+    return shown
+
+
+def _rgba(pixels: NDArray[Any], spec: Any) -> NDArray[Any]:
+    names = list(spec.channelnames)
+    count = spec.nchannels
+    alpha = spec.alpha_channel
+    if not 0 <= alpha < count:  # unnamed fourth or second channels are alpha; a depth is not
+        alpha = count - 1 if count in (2, 4) and spec.z_channel != count - 1 else -1
+    if count > 4 and all(c in names for c in "RGB"):
+        rgb = [names.index(c) for c in "RGB"]
+    else:
+        rgb = [0, 1, 2] if count >= 3 else [0, 0, 0]
+    opaque = 255 if pixels.dtype == np.uint8 else 1.0
+    if count == 4 and alpha == 3:
+        return np.ascontiguousarray(pixels)
+    out = np.empty((*pixels.shape[:2], 4), pixels.dtype)
+    out[..., :3] = pixels[..., rgb]
+    out[..., 3] = pixels[..., alpha] if alpha >= 0 else opaque
+    return out
+
+
+# --- writing -----------------------------------------------------------------------------------------------------
+
+
+def encoded(path: str, pixels: NDArray[Any], spec: Any) -> bytes:
+    """The whole file in memory: on a full disk some writers say nothing, and one ends the process.
+
+    Args:
+        path: whose extension says which format.
+        spec: OpenImageIO's description of it.
+    """
+    import OpenImageIO as oiio
+
+    with memory_file() as name:
+        file = oiio.ImageOutput.create(extension_of(path)[1:])
+        if file is None:
+            raise ImageError(f"{path}: cannot be encoded: {reason(oiio.geterror())}")
+        opened = file.open(name, spec)
+        written = opened and file.write_image(pixels)
+        closed = opened and file.close()
+        if not (written and closed):
+            raise ImageError(f"{path}: cannot be encoded: {reason(file.geterror(), name)}")
+        data = Path(name).read_bytes()
+    if extension_of(path) == ".png" and not data.endswith(_PNG_END):
+        raise ImageError(f"{path}: cannot be encoded: out of memory, or over the limit on file sizes")
+    return data

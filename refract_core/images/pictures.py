@@ -1,0 +1,275 @@
+"""Image files in and out: textures, pictures, and (from the room beside it) cubemaps.
+
+OpenImageIO is known here, in `image_files` and in `image_cubemaps` alone, and loaded with the first file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ImageError, UsageError
+from ..files import check_place, replacing
+from ..scene import F32, Texture
+from .aovs import AOVS, check_names, shape_of
+from .cubemap_files import read_cubemap, read_notes, write_cubemap
+from .files import HALF_MAX, MAX_TEXTURE_PIXELS, encoded, extension_of, named_file, read_pixels, reason
+from .srgb import srgb_decode, srgb_encode
+
+__all__ = [
+    "MAX_TEXTURE_PIXELS",
+    "check_output",
+    "check_writable",
+    "default_aovs",
+    "display",
+    "read_cubemap",
+    "read_notes",
+    "read_texture",
+    "write_cubemap",
+    "write_frame",
+    "write_map",
+]
+
+COLOR_SPACES = ("auto", "raw", "sRGB")
+COLOR_CORRECTIONS = ("disabled", "sRGB", "openColorIO")
+LAYERED = (".exr",)
+EIGHT_BIT = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+_PNG_LEVEL, _PNG_SUB = 4, 0x10
+"""zlib's level, and libpng's flag for differences to the left neighbour: written in half the time the defaults take, at
+about the same size."""
+_STRAIGHT_ALPHA = "oiio:UnassociatedAlpha"
+_LINEAR_REC709 = "lin_rec709_scene"
+
+
+# --- reading -----------------------------------------------------------------------------------------------------
+
+
+def read_texture(source: str | bytes, *, name: str, color_space: str) -> Texture:
+    """Decode an image file into RGBA.
+
+    Missing channels are filled as UsdUVTexture does: one channel is grey, two are grey and alpha, and alpha is 1
+    where the file has none. Values stay as the file has them, never premultiplied. 8-bit files stay uint8; 16-bit
+    integers become float32 in [0, 1], linear after `sRGB`; half and float files are linear whatever `color_space` says.
+
+    Args:
+        source: a path, or the bytes of a file (from inside a package).
+        name: what messages call it.
+        color_space: `raw`, `sRGB`, or `auto`: sRGB where the file has 8 bits and 3 or 4 channels, else raw.
+
+    Raises:
+        ImageError: unreadable, damaged, too large, or an unknown colour space.
+    """
+    if color_space not in COLOR_SPACES:
+        raise ImageError(f"{name}: colour space is '{color_space}'; choose from {', '.join(COLOR_SPACES)}")
+    with named_file(source, name) as path:
+        pixels, channels, integer, _ = read_pixels(path, name)
+    if pixels.dtype == np.uint8:
+        srgb = color_space == "sRGB" or (color_space == "auto" and channels >= 3)
+        return Texture(name, pixels, srgb)
+    if integer and color_space == "sRGB":
+        pixels[..., :3] = srgb_decode(pixels[..., :3])
+    return Texture(name, pixels)
+
+
+# --- writing -----------------------------------------------------------------------------------------------------
+
+
+def default_aovs(path: str, available: Sequence[str]) -> tuple[str, ...]:
+    """What a file holds when nobody says: everything in an EXR, the picture elsewhere."""
+    return tuple(available) if _extension(path) in LAYERED else ("beauty",)
+
+
+def check_output(path: str, aovs: Sequence[str], color_correction: str) -> None:
+    """Refuse, before any work, what `write_frame` could not write.
+
+    Raises:
+        UsageError: the extension, an AOV or the correction is unknown, or the format cannot hold these AOVs.
+    """
+    extension = _extension(path)
+    check_names(aovs)
+    if color_correction not in COLOR_CORRECTIONS:
+        raise UsageError(
+            f"color correction mode is '{color_correction}', which is not known; "
+            f"choose from {', '.join(COLOR_CORRECTIONS)}"
+        )
+    if extension in LAYERED:
+        return
+    if len(aovs) > 1:
+        raise UsageError(
+            f"{path}: {extension} holds one AOV, but {', '.join(aovs)} are asked for; name one, or write a .exr file"
+        )
+    if "P" in aovs:
+        raise UsageError(f"{path}: AOV 'P' is positions, which {extension} cannot hold; write a .exr file")
+
+
+def check_writable(path: str) -> None:
+    """Refuse, before any work, a place where no file can be written.
+
+    Raises:
+        UsageError: the extension is unknown.
+        ImageError: the folder does not exist or is read-only, or `path` is a folder.
+    """
+    _extension(path)
+    check_place(path, ImageError)
+
+
+def write_frame(
+    path: str, planes: Mapping[str, F32], metadata: Mapping[str, str | float], *, color_correction: str = "sRGB"
+) -> None:
+    """Write planes to a file, in one step: the file appears whole, or not at all.
+
+    Args:
+        path: `.exr` takes any planes as scene-linear channels, colours as half and data as float32; the 8-bit formats
+            take exactly one.
+        planes: AOV name -> float32, shapes as `refract_core.aovs.shape_of`.
+        metadata: attributes of the file, where the format has a place for them (EXR; PNG as text).
+        color_correction: `sRGB`, `disabled` or `openColorIO`; colours in 8-bit files only.
+
+    Raises:
+        UsageError: see `check_output`.
+        ImageError: the file cannot be written.
+    """
+    check_output(path, tuple(planes), color_correction)
+    if not planes:
+        raise UsageError(f"{path}: no AOV is chosen; name at least one")
+    height, width = next(iter(planes.values())).shape[:2]
+    for name, plane in planes.items():
+        if plane.shape != shape_of(name, height, width):
+            raise ImageError(f"{path}: plane '{name}' has shape {plane.shape}, not {shape_of(name, height, width)}")
+    pixels: NDArray[Any]
+    if _extension(path) in LAYERED:
+        pixels, spec = _exr(planes, metadata, height, width)
+    else:
+        ((name, plane),) = planes.items()
+        pixels, spec = _eight_bit(path, name, plane, metadata, color_correction)
+    data = encoded(path, pixels, spec)
+    with replacing(path, ImageError) as temporary:
+        Path(temporary).write_bytes(data)
+
+
+def write_map(path: str, plane: F32, metadata: Mapping[str, str | float]) -> None:
+    """Write one number per texel as half floats in the one channel Y of an .exr, in one step. Equal input, equal bytes.
+
+    Args:
+        plane: shape (H, W), row 0 on top.
+        metadata: attributes of the file.
+
+    Raises:
+        UsageError: not an .exr file.
+        ImageError: the file cannot be written.
+    """
+    import OpenImageIO as oiio
+
+    if _extension(path) not in LAYERED:
+        raise UsageError(f"{path}: a map is written as .exr; change the extension")
+    spec = oiio.ImageSpec(plane.shape[1], plane.shape[0], 1, "half")
+    spec.channelnames = ("Y",)
+    spec.attribute("compression", "zip")
+    spec.attribute("DateTime", "")
+    for key, value in metadata.items():
+        spec.attribute(key, value)
+    data = encoded(path, np.ascontiguousarray(np.clip(plane, -HALF_MAX, HALF_MAX))[..., None], spec)
+    with replacing(path, ImageError) as temporary:
+        Path(temporary).write_bytes(data)
+
+
+def _extension(path: str) -> str:
+    extension = extension_of(path)
+    if extension not in LAYERED + EIGHT_BIT:
+        known = ", ".join(LAYERED + EIGHT_BIT)
+        raise UsageError(f"{path}: '{extension}' is not a known image extension; use one of {known}")
+    return extension
+
+
+def _exr(planes: Mapping[str, F32], metadata: Mapping[str, str | float], height: int, width: int) -> tuple[F32, Any]:
+    import OpenImageIO as oiio
+
+    names: list[str] = []
+    formats: list[str] = []
+    columns: list[F32] = []
+    for name, plane in planes.items():
+        aov = AOVS[name]
+        names += aov.channels
+        formats += ["half" if aov.color else "float"] * len(aov.channels)
+        column = plane.reshape(height, width, len(aov.channels))
+        # A colour beyond the largest half would become infinity, which no viewer averages well.
+        columns.append(np.clip(column, -HALF_MAX, HALF_MAX) if aov.color else column)
+    spec = oiio.ImageSpec(width, height, len(names), "float")
+    spec.channelnames = tuple(names)
+    spec.channelformats = tuple(oiio.TypeDesc(one) for one in formats)
+    spec.attribute("compression", "zip")
+    spec.attribute("DateTime", "")  # else the writer stamps the time, and equal pictures make unequal files
+    for key, value in metadata.items():
+        spec.attribute(key, value)
+    return np.ascontiguousarray(np.concatenate(columns, axis=2), dtype=np.float32), spec
+
+
+def _eight_bit(
+    path: str, name: str, plane: F32, metadata: Mapping[str, str | float], color_correction: str
+) -> tuple[NDArray[np.uint8], Any]:
+    import OpenImageIO as oiio
+
+    extension = _extension(path)
+    pixels = display(name, plane, color_correction)
+    if pixels.shape[2] == 4 and extension in (".jpg", ".jpeg"):  # no alpha there: the picture over black
+        over_black = plane.copy()
+        over_black[..., 3] = 1.0
+        pixels = np.ascontiguousarray(display(name, over_black, color_correction)[..., :3])
+    height, width, channels = pixels.shape
+    spec = oiio.ImageSpec(width, height, channels, "uint8")
+    spec.attribute(_STRAIGHT_ALPHA, 1)
+    spec.attribute("DateTime", "")
+    if AOVS[name].color and color_correction == "sRGB":
+        spec.attribute("oiio:ColorSpace", "srgb_rec709_scene")
+    if extension in (".jpg", ".jpeg"):
+        spec.attribute("Compression", "jpeg:95")
+    if extension == ".png":
+        spec.attribute("png:compressionLevel", _PNG_LEVEL)
+        spec.attribute("png:filter", _PNG_SUB)
+        for key, value in metadata.items():
+            spec.attribute(key, str(value))
+    return pixels, spec
+
+
+def display(name: str, plane: F32, color_correction: str = "sRGB") -> NDArray[np.uint8]:
+    """8-bit picture of one AOV, as a PNG holds it.
+
+    Args:
+        name: the AOV.
+        plane: float32, shape as `refract_core.aovs.shape_of`; `beauty` is premultiplied.
+        color_correction: applied to colours; data is never corrected.
+
+    Returns:
+        uint8, shape (H, W, 1), (H, W, 3), or (H, W, 4) with straight alpha.
+    """
+    aov = AOVS[name]
+    values = plane.reshape(*plane.shape[:2], len(aov.channels)).astype(np.float32)
+    if name == "N":
+        values = values * 0.5 + 0.5
+    if aov.color:
+        if values.shape[2] == 4:
+            alpha = values[..., 3:]
+            np.divide(values[..., :3], alpha, out=values[..., :3], where=alpha > 0.0)
+        values[..., :3] = _corrected(np.ascontiguousarray(values[..., :3]), color_correction)
+    clamped = np.clip(np.nan_to_num(values, nan=0.0), 0.0, 1.0)
+    return np.asarray(clamped * 255.0 + 0.5).astype(np.uint8)
+
+
+def _corrected(rgb: F32, color_correction: str) -> F32:
+    if color_correction == "disabled":
+        return rgb
+    if color_correction == "sRGB":
+        return srgb_encode(np.clip(rgb, 0.0, 1.0))
+    import OpenImageIO as oiio
+
+    shown = oiio.ImageBufAlgo.ociodisplay(oiio.ImageBuf(rgb), "", "", _LINEAR_REC709)
+    if shown.has_error:
+        raise UsageError(
+            f"color correction mode openColorIO: {reason(shown.geterror())}; "
+            "set OCIO to a config with a default view, unset it, or use sRGB"
+        )
+    return np.asarray(shown.get_pixels(oiio.FLOAT), np.float32).reshape(rgb.shape)

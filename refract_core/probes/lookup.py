@@ -1,0 +1,234 @@
+"""The probe tier: pictures taken in the scene, looked up with local correction where their influence reaches.
+
+A picture keeps colour, coverage (0 where the sky is seen) and distance. Where a texel shows the sky, the probe hands
+its share on to the sky tier, which knows the direction exactly (Arm, "Combining reflections from a distant
+environment"); where no sky tier follows, the probe adds the sky itself.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..kernels.compile import inlined
+from ..kernels.vec import along, length, row, scale, sub, transform_direction, transform_point
+from ..optics.interface import probe_lod_hdrp
+from ..scene import Camera, Probe
+from ..world.environment import prefiltered
+from .faces import CUBE, WINDOW, direction_face, layout, level_at, level_count
+from .planar import window_of, window_weight
+from .reach import Reach, reach_of
+from .volumes import INFINITE_DISTANCE, distance_fade, influence_box, influence_sphere, ray_box, ray_sphere
+
+_AVERAGE_MEDIAN = 0.59
+"""Median radius of a level-0 texel looked up bilinearly, in texels; it doubles with every level of averages."""
+
+
+class ProbeTable(NamedTuple):
+    """All probes in the order in which they are asked: importance, then smaller volume (HDRP, 4.7)."""
+
+    texels: NDArray[np.float32]
+    """flat pool of every picture's levels (see `faces`)"""
+    first: NDArray[np.int64]
+    """shape (K, L): offset of each level in the pool"""
+    side: NDArray[np.int64]
+    """shape (K, L): texels on a side of each level"""
+    last: NDArray[np.int64]
+    """shape (K,): highest level"""
+    planar: NDArray[np.uint8]
+    capture: NDArray[np.float64]
+    """shape (K, 3) [m]"""
+    eye: NDArray[np.float64]
+    """shape (K, 4): the camera in the influence volume's frame, homogeneous: a point [m] and 1, or for an orthographic
+    camera the direction towards it and 0"""
+    owned: NDArray[np.uint8]
+    """shape (K,): 1 where it serves only the things that are given to it"""
+    reach: Reach
+    """of the influence volumes of those that serve everything"""
+    influence: NDArray[np.float64]
+    """shape (K, 4, 4) volume_from_world"""
+    influence_sphere: NDArray[np.uint8]
+    influence_extents: NDArray[np.float64]
+    """shape (K, 3) [m]"""
+    proxy: NDArray[np.float64]
+    """shape (K, 4, 4) volume_from_world"""
+    proxy_kind: NDArray[np.uint8]
+    """shape (K,): 0 box, 1 sphere, 2 infinite"""
+    proxy_extents: NDArray[np.float64]
+    blend: NDArray[np.float64]
+    """shape (K, 6) [m]"""
+    blend_normal: NDArray[np.float64]
+    face_fade: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    """shape (K,): weight with the fade by distance to the camera in it"""
+    multiplier: NDArray[np.float64]
+    sharp_near: NDArray[np.uint8]
+    """shape (K,): HDRP's distance-based roughness"""
+
+
+def camera_weight(probe: Probe, eye: NDArray[np.float64]) -> float:
+    """The probe's weight with its fade by the distance of its origin to the camera at `eye`."""
+    distance = float(np.linalg.norm(probe.influence.world_from_volume[:3, 3] - eye))
+    return probe.weight * distance_fade(distance, max(probe.fade_distance, 1e-6))
+
+
+def bounds_of(probe: Probe) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Low and high corner of the influence volume in engine world [m]."""
+    m, extents = probe.influence.world_from_volume, np.array(probe.influence.extents)
+    half = extents if probe.influence.sphere else np.abs(m[:3, :3]) @ extents
+    return m[:3, 3] - half, m[:3, 3] + half
+
+
+def empty_table(probes: list[Probe], owned: list[bool], camera: Camera, rough: bool) -> ProbeTable:
+    """A table with room for every level of every probe; `capture` fills the texels."""
+    count = len(probes)
+    faces = [WINDOW if p.planar else CUBE for p in probes]
+    sizes = [p.cubemap.resolution if p.cubemap else p.resolution for p in probes]
+    levels = [level_count(n, f, rough) for n, f in zip(sizes, faces, strict=True)]
+    first = np.full((count, max(levels, default=1)), -1, np.int64)
+    side = np.ones_like(first)
+    total = 0
+    for k in range(count):
+        where, total = layout(sizes[k], levels[k], faces[k], total)
+        first[k, : levels[k]], side[k, : levels[k]] = where
+    eye = camera.world_from_camera[:3, 3]
+    towards = np.array([*camera.world_from_camera[:3, 2], 0.0]) if camera.orthographic else np.array([*eye, 1.0])
+
+    def each(get: Any, dtype: Any, shape: tuple[int, ...] = ()) -> NDArray[Any]:
+        return np.array([get(p) for p in probes], dtype).reshape((count, *shape))
+
+    def kind(p: Probe) -> int:
+        return 2 if p.proxy is None else int(p.proxy.sphere)
+
+    inverse = each(lambda p: np.linalg.inv(p.influence.world_from_volume), np.float64, (4, 4))
+    bounds = np.array([bounds_of(p) for p in probes], np.float64).reshape(count, 2, 3)
+    bounds[np.array(owned, bool)] = np.inf  # out of everybody's reach
+    return ProbeTable(
+        texels=np.zeros(total, np.float32),
+        first=first,
+        side=side,
+        last=np.array(levels, np.int64) - 1,
+        planar=each(lambda p: p.planar, np.uint8),
+        capture=each(lambda p: p.capture_point, np.float64, (3,)),
+        eye=np.ascontiguousarray(inverse @ towards),
+        owned=np.array(owned, np.uint8),
+        reach=reach_of(bounds[:, 0], bounds[:, 1]),
+        influence=inverse,
+        influence_sphere=each(lambda p: p.influence.sphere, np.uint8),
+        influence_extents=each(lambda p: p.influence.extents, np.float64, (3,)),
+        proxy=each(lambda p: np.linalg.inv((p.proxy or p.influence).world_from_volume), np.float64, (4, 4)),
+        proxy_kind=each(kind, np.uint8),
+        proxy_extents=each(lambda p: (p.proxy or p.influence).extents, np.float64, (3,)),
+        blend=each(lambda p: p.blend_distance, np.float64, (6,)),
+        blend_normal=each(lambda p: p.blend_normal_distance, np.float64, (6,)),
+        face_fade=each(lambda p: p.face_fade, np.float64, (6,)),
+        weight=each(lambda p: camera_weight(p, eye), np.float64),
+        multiplier=each(lambda p: p.multiplier, np.float64),
+        sharp_near=each(lambda p: p.distance_roughness, np.uint8),
+    )
+
+
+# ------------------------------------------------------------------------------------------------ volumes
+
+
+@inlined
+def proxy_distance(table, k, p, d):  # type: ignore[no-untyped-def]
+    """Distance from `p` along unit `d` to the proxy volume of probe `k`, at least 0 [m]."""
+    if table.proxy_kind[k] == 2:
+        return INFINITE_DISTANCE
+    m = table.proxy[k]
+    o, v = transform_point(m, p), transform_direction(m, d)
+    e = row(table.proxy_extents, k)
+    s = ray_sphere(o, v, e[0]) if table.proxy_kind[k] == 1 else ray_box(o, v, e)
+    return max(s, 0.0)
+
+
+@inlined
+def influence(table, k, p, n, d):  # type: ignore[no-untyped-def]
+    """Weight 0 .. 1 of probe `k` at a point, for a ray along `d` from a surface with normal `n`."""
+    m = table.influence[k]
+    q = transform_point(m, p)
+    from_capture = sub(p, row(table.capture, k))
+    e = row(table.influence_extents, k)
+    if table.influence_sphere[k] != 0:
+        w = influence_sphere(q, n, from_capture, e[0], table.blend[k, 0], table.blend_normal[k, 0])
+    else:
+        w = influence_box(
+            q, n, transform_direction(m, d), from_capture, e, table.blend[k], table.blend_normal[k], table.face_fade[k]
+        )
+    return w * table.weight[k]
+
+
+# ------------------------------------------------------------------------------------------------ lookup
+
+
+@inlined
+def cube_at(table, k, d, lod):  # type: ignore[no-untyped-def]
+    """Trilinear (r, g, b, coverage, distance) of cube `k` in a direction, which need not be unit."""
+    face, x, y = direction_face(d)
+    return level_at(table.texels, table.first[k], table.side[k], table.last[k], face, x, y, lod)
+
+
+@inlined
+def _cube_roughness(table, k, blur, roughness, hdrp, s, far):  # type: ignore[no-untyped-def]
+    """Perceptual roughness of the lobe that the cube shall be looked up with.
+
+    The cone of half angle atan(`blur`) is blur s wide where it meets the proxy, and the capture sees that from `far`
+    away: nothing has to be guessed about distance. HDRP's own way takes the material's roughness as it is, or lowered
+    by its distance-based roughness (LightEvaluation.hlsl).
+    """
+    if not hdrp:
+        return math.sqrt(min(1.0, 0.5 * blur * s / max(far, 1e-9)))
+    if table.sharp_near[k] == 0 or table.proxy_kind[k] == 2:
+        return roughness
+    lowered = min(roughness, s / max(far, 1e-9) * roughness)
+    return lowered + (roughness - lowered) * roughness
+
+
+@inlined
+def probe_light(table, k, p, d, blur, roughness, hdrp, environment, sky_follows):  # type: ignore[no-untyped-def]
+    """What probe `k` shows to a ray from `p` along unit `d`.
+
+    Args:
+        blur: tangent of the half angle of the ray's cone.
+        roughness: perceptual, for HDRP's mapping, which `hdrp` asks for.
+        sky_follows: a later tier will add the sky.
+
+    Returns:
+        (colour already weighted by coverage, coverage: the share of it that is not sky, factor on the probe's weight,
+        confidence: how far the proxy's guess of the distance can be trusted)
+    """
+    s = proxy_distance(table, k, p, d)
+    meets = along(p, d, s)
+    if table.planar[k] != 0:
+        eye, m, e = table.eye[k], table.influence[k], row(table.influence_extents, k)
+        local = transform_point(m, meets)
+        face, x, y, far, width = window_of(eye, local, e, s * blur)
+        fits = 0.0
+        if face >= 0:
+            fits = window_weight(eye, transform_point(m, p), face, e, x, y)
+        if fits <= 0.0:
+            return (0.0, 0.0, 0.0), 1.0, 0.0, 0.0
+        texels = width / _AVERAGE_MEDIAN * table.side[k, 0]
+        lod = 0.5 * math.log2(1.0 + texels * texels)
+        r, g, b, coverage, seen = level_at(table.texels, table.first[k], table.side[k], table.last[k], face, x, y, lod)
+        sky, gloss = d, math.sqrt(min(1.0, 0.5 * blur))
+    else:
+        fits = 1.0
+        sky = sub(meets, row(table.capture, k))
+        far = length(sky)
+        gloss = _cube_roughness(table, k, blur, roughness, hdrp, s, far)
+        r, g, b, coverage, seen = cube_at(table, k, sky, probe_lod_hdrp(gloss))
+    confidence = 0.0
+    if seen > 0.0 and far > 0.0:
+        confidence = min(seen, far) / max(seen, far)
+    if coverage < 1.0 and not sky_follows:
+        if environment.present:
+            light = prefiltered(environment, sky, gloss)
+            left = 1.0 - coverage
+            r, g, b = r + light[0] * left, g + light[1] * left, b + light[2] * left
+        coverage = 1.0
+    return scale((r, g, b), table.multiplier[k]), coverage, fits, confidence

@@ -1,0 +1,200 @@
+"""Which probes serve a picture, decided before the BVH is built, because what they see is marked in it.
+
+A stage's own probes come in HDRP's order; those that cannot reach any glass are left out. Where the stage has none,
+glass gets its own: captured at its centre, with the scene's bounds as proxy (Arm's preparation steps: stand in the
+object, hide it, draw six faces).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..scene import Camera, Material, Notice, Param, Probe, Scene, Volume
+from ..world.embree import FIRST_CAPTURED_BIT, OPAQUE, OPAQUE_STATIC
+from ..world.tables import prim_of
+from .lookup import bounds_of, camera_weight
+
+_MAX_OWN = 8
+"""Glass beyond this many things shares capture points with its neighbours."""
+_MAX_SETS = 31 - FIRST_CAPTURED_BIT
+_EVERYWHERE = 1e9  # half size of an influence without limits [m]
+
+Box = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+class Entry(NamedTuple):
+    """One probe of the picture."""
+
+    probe: Probe
+    owned: bool
+    """it serves only the things that `Plan.thing_probe` gives it"""
+    mask: int
+    """what it sees"""
+    drawn: bool
+    """False: it lends its proxy to the screen tier and shows nothing"""
+
+
+class Plan(NamedTuple):
+    """What to capture."""
+
+    entries: list[Entry]
+    thing_probe: NDArray[np.int32]
+    """shape (things,): the entry whose proxy serves a thing, -1 for opaque things"""
+    captured_sets: list[frozenset[str] | None]
+    notices: tuple[Notice, ...] = ()
+
+
+def in_order(probes: list[Probe]) -> list[Probe]:
+    """Higher importance first, then smaller influence volume, then as given."""
+
+    def volume(probe: Probe) -> float:
+        low, high = bounds_of(probe)
+        return float(np.prod(high - low))
+
+    return sorted(probes, key=lambda probe: (-probe.importance, volume(probe)))
+
+
+def plan_capture(scene: Scene, probes: list[Probe]) -> Plan:
+    """A plan that draws these probes, whatever they serve."""
+    sets: list[frozenset[str] | None] = []
+    notices: list[Notice] = []
+    entries = [Entry(probe, False, _mask_of(scene, probe, sets, notices), True) for probe in probes]
+    return Plan(entries, np.full(len(scene.meshes) + len(scene.spheres), -1, np.int32), sets, tuple(notices))
+
+
+def plan_picture(scene: Scene, camera: Camera, height: int, wanted: bool) -> Plan:
+    """Choose the probes of a picture.
+
+    Args:
+        height: of the picture [pixels], to which the resolution of own probes is fitted.
+        wanted: something is going to ask for probes.
+    """
+    glass = _glass(scene)
+    thing_probe = np.full(len(scene.meshes) + len(scene.spheres), -1, np.int32)
+    if not wanted or not glass:
+        return Plan([], thing_probe, [])
+    serving = [p for p in in_order(list(scene.probes)) if _serves(p, camera, glass, scene)]
+    plan = plan_capture(scene, serving)
+    entries = plan.entries
+    for k, entry in reversed(list(enumerate(entries))):
+        for thing, (low, high) in glass.items():
+            if contains(entry.probe.influence, (low + high) / 2):
+                thing_probe[thing] = k
+    alone = {thing: box for thing, box in glass.items() if thing_probe[thing] < 0}
+    _add_own(entries, alone, thing_probe, scene, height, drawn=not scene.probes)
+    return plan._replace(entries=entries, thing_probe=thing_probe)
+
+
+def _serves(probe: Probe, camera: Camera, glass: dict[int, Box], scene: Scene) -> bool:
+    """Some glass, widened by how far its rays may travel inside, lies within the probe's influence."""
+    if camera_weight(probe, camera.world_from_camera[:3, 3]) <= 0.0:
+        return False
+    low, high = bounds_of(probe)
+    for thing, (least, most) in glass.items():
+        margin = float(np.linalg.norm(most - least)) + _longest_thickness(scene, thing)
+        if (least - margin <= high).all() and (most + margin >= low).all():
+            return True
+    return False
+
+
+def _longest_thickness(scene: Scene, thing: int) -> float:
+    count = len(scene.meshes)
+    used = np.unique(scene.meshes[thing].materials) if thing < count else [scene.spheres[thing - count].material]
+    return max((_thickness_bound(scene.materials[int(m)]) for m in used), default=0.0)
+
+
+def _thickness_bound(material: Material) -> float:
+    source = material.inputs[Param.THICKNESS]
+    if source.primvar:
+        return math.inf
+    return max(source.value[0], abs(source.scale[0]) + abs(source.bias[0]) if source.texture >= 0 else 0.0)
+
+
+def _glass(scene: Scene) -> dict[int, Box]:
+    """Bounds of every thing with a refractive material, by its number."""
+    refractive = np.array([m.refractive for m in scene.materials], bool)
+    found = {}
+    for thing, mesh in enumerate(scene.meshes):
+        keep = refractive[mesh.materials]
+        if keep.any():
+            points = mesh.points[mesh.triangles[keep].ravel()].astype(np.float64)
+            found[thing] = (points.min(0), points.max(0))
+    for i, ball in enumerate(scene.spheres):
+        if refractive[ball.material]:
+            centre = np.array(ball.centre, np.float64)
+            found[len(scene.meshes) + i] = (centre - ball.radius, centre + ball.radius)
+    return found
+
+
+def seen_things(scene: Scene, probe: Probe) -> frozenset[str]:
+    """Prim paths of what a probe's `captured` collection leaves it, glass included."""
+    baked = probe.mode != "realtime"
+    things = [(m.path, m.static) for m in scene.meshes] + [(s.path, s.static) for s in scene.spheres]
+    here = [prim_of(path) for path, static in things if static or not baked]
+    return frozenset(here if probe.captured is None else set(here) & set(probe.captured))
+
+
+def _mask_of(scene: Scene, probe: Probe, sets: list[frozenset[str] | None], notices: list[Notice]) -> int:
+    everything = int(OPAQUE_STATIC if probe.mode != "realtime" else OPAQUE)
+    if probe.captured is None:
+        return everything
+    seen = seen_things(scene, probe)
+    if seen not in sets:
+        if len(sets) >= _MAX_SETS:
+            text = f"more than {_MAX_SETS} different collections 'captured' in one stage; this probe sees everything"
+            notices.append(Notice(probe.path, f"{text}. Let several probes share one collection, or bake them apart"))
+            return everything
+        sets.append(seen)
+    return 1 << (FIRST_CAPTURED_BIT + sets.index(seen))
+
+
+def contains(volume: Volume, point: NDArray[np.float64]) -> bool:
+    """The point is inside the box or sphere."""
+    m = np.linalg.inv(volume.world_from_volume)
+    p = m[:3, :3] @ point + m[:3, 3]
+    if volume.sphere:
+        return bool(np.linalg.norm(p) <= volume.extents[0])
+    return bool((np.abs(p) <= np.array(volume.extents)).all())
+
+
+def _add_own(
+    entries: list[Entry], alone: dict[int, Any], thing_probe: NDArray[np.int32], scene: Scene, height: int, drawn: bool
+) -> None:
+    """Give every thing in `alone` a probe at its centre; many things share the nearest of a few, spread widely."""
+    if not alone:
+        return
+    things = sorted(alone, key=lambda thing: -float(np.prod(alone[thing][1] - alone[thing][0] + 1e-9)))
+    centres = np.array([(alone[thing][0] + alone[thing][1]) / 2 for thing in things])
+    chosen = [0]
+    while len(chosen) < min(_MAX_OWN, len(things)):
+        away = np.min(np.linalg.norm(centres[:, None] - centres[chosen][None], axis=2), axis=1)
+        chosen.append(int(np.argmax(away)))
+    nearest = np.argmin(np.linalg.norm(centres[:, None] - centres[chosen][None], axis=2), axis=1)
+    base = len(entries)
+    for i in chosen:
+        proxy = scene.bounds if drawn else tuple(tuple(side) for side in alone[things[i]])
+        entries.append(Entry(_own_probe(centres[i], proxy, height), True, int(OPAQUE), drawn))
+    for thing, group in zip(things, nearest, strict=True):
+        thing_probe[thing] = base + group
+
+
+def _own_probe(centre: NDArray[np.float64], proxy: Any, height: int) -> Probe:
+    low, high = np.array(proxy[0], np.float64), np.array(proxy[1], np.float64)
+    frame = np.eye(4)
+    frame[:3, 3] = (low + high) / 2
+    half = np.maximum((high - low) / 2, 1e-3) * 1.0005
+    here = np.eye(4)
+    here[:3, 3] = centre
+    return Probe(
+        path="",
+        mode="realtime",
+        capture_point=(float(centre[0]), float(centre[1]), float(centre[2])),
+        influence=Volume(here, False, (_EVERYWHERE,) * 3),
+        proxy=Volume(frame, False, (float(half[0]), float(half[1]), float(half[2]))),
+        resolution=1 << min(9, max(5, round(math.log2(max(height, 1) / 5)))),
+        clipping=(1e-4, 1e9),
+    )

@@ -1,0 +1,213 @@
+"""The hierarchy: each tier gives colour and weight, in the order asked for, until the weight is spent.
+
+Roughness is one cone for all of them (`blur`, the tangent of its half angle); Fresnel and absorption are applied by
+the caller, once. So a room of one colour comes out as that colour whichever tier answers.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..kernels.compile import inlined
+from ..kernels.sampling import unit_pair
+from ..kernels.vec import add, frame, normalize, row, scale
+from ..optics.interface import screen_lod_hdrp
+from ..probes.lookup import influence, probe_light, proxy_distance
+from ..probes.reach import next_of, piece_of
+from ..probes.volumes import update_headroom
+from ..view.screen import screen_march, screen_proxy
+from ..world.embree import LANES, OPAQUE, SCATTERED, clear, set_ray
+from ..world.environment import prefiltered
+from ..world.shading import load_hits, shade
+from ..world.tracing import intersect_world
+
+SCREEN, RAY, PROBE, SKY = 0, 1, 2, 3
+"""Codes of `settings.TIERS`, in its order."""
+BY_MARCH = np.bool_(False)
+"""For `ask`: reflections march also where refraction goes by proxy, as HDRP's own do."""
+NONE = 4
+"""Column of the weights for what no tier answered."""
+EMBEDDED_ONLY, ALL_RAYS = np.bool_(True), np.bool_(False)
+_ROUGH_RAY = 3  # purpose of the sampling sequence
+_SPENT = 1.0 - 1e-6
+
+
+class Query(NamedTuple):
+    """Eight rays that want a colour, and what they got."""
+
+    on: Any
+    origin: Any
+    direction: Any
+    normal: Any
+    """of the entry, on the viewer's side (probes' influence)"""
+    blur: Any
+    roughness: Any
+    """perceptual, for HDRP's own mappings"""
+    thing: Any
+    embedded: Any
+    """1: the ray starts inside a medium and is known to meet an opaque object there"""
+    color: Any
+    weight: Any
+    """shape (8, 5): screen, ray, probe, sky, none; sums to 1"""
+    confidence: Any
+
+
+def new_query() -> Query:
+    """Room for eight rays."""
+    z = np.zeros
+    return Query(
+        z(LANES, np.int32), z((LANES, 3)), z((LANES, 3)), z((LANES, 3)), z(LANES), z(LANES), z(LANES, np.int32),
+        z(LANES, np.int32), z((LANES, 3)), z((LANES, 5)), z(LANES),
+    )  # fmt: skip
+
+
+@inlined
+def _add(query, lane, tier, color, weight, confidence):  # type: ignore[no-untyped-def]
+    for c in range(3):
+        query.color[lane, c] += color[c] * weight
+    query.weight[lane, tier] += weight
+    query.weight[lane, NONE] -= weight
+    query.confidence[lane] += weight * confidence
+
+
+@inlined
+def _headroom(query, lane):  # type: ignore[no-untyped-def]
+    return query.weight[lane, NONE]
+
+
+@inlined
+def ask(query, order, hdrp, screen, probes, thing_probe, z_self, block, second, third, packet, world, sample):  # type: ignore[no-untyped-def]
+    """Fill colour, weight and confidence of every lane that is on.
+
+    Args:
+        order: tier codes, first asked first.
+        hdrp: screen tier by proxy instead of by march, with HDRP's mapping of roughness.
+        thing_probe: shape (things,), the probe whose proxy serves each thing, or -1.
+        z_self: shape (8,), z_depth of the shaded pixels.
+        block: gives the pixels; `second`, `third` and the packet are overwritten.
+    """
+    inside = False
+    for lane in range(LANES):
+        for c in range(3):
+            query.color[lane, c] = 0.0
+        for k in range(5):
+            query.weight[lane, k] = 0.0
+        query.weight[lane, NONE] = 1.0
+        query.confidence[lane] = 0.0
+        inside = inside or (query.on[lane] != 0 and query.embedded[lane] != 0)
+    if inside:
+        _ask_rays(query, EMBEDDED_ONLY, block, second, third, packet, world, sample)
+    for i in range(order.shape[0]):
+        tier = order[i]
+        if tier == RAY:
+            _ask_rays(query, ALL_RAYS, block, second, third, packet, world, sample)
+            continue
+        sky_follows = False
+        for j in range(i + 1, order.shape[0]):
+            sky_follows = sky_follows or order[j] == SKY
+        for lane in range(LANES):
+            if query.on[lane] == 0 or _headroom(query, lane) <= 1.0 - _SPENT:
+                continue
+            if tier == SCREEN:
+                _ask_screen(query, lane, hdrp, screen, probes, thing_probe, z_self, block)
+            elif tier == PROBE:
+                _ask_probes(query, lane, hdrp, probes, thing_probe, world, sky_follows)
+            elif tier == SKY and world.environment.present:
+                gloss = query.roughness[lane] if hdrp else math.sqrt(min(1.0, 0.5 * query.blur[lane]))
+                light = prefiltered(world.environment, row(query.direction, lane), gloss)
+                _add(query, lane, SKY, light, _headroom(query, lane), 1.0)
+
+
+@inlined
+def _ask_screen(query, lane, hdrp, screen, probes, thing_probe, z_self, block):  # type: ignore[no-untyped-def]
+    origin, direction = row(query.origin, lane), row(query.direction, lane)
+    if hdrp:
+        k = thing_probe[query.thing[lane]]
+        if k < 0:
+            return
+        distance = proxy_distance(probes, k, origin, direction)
+        lod = screen_lod_hdrp(query.roughness[lane], screen.color_level.shape[0])
+        px, py = block.pixel[lane, 0] + 0.5, block.pixel[lane, 1] + 0.5
+        color, w, confidence = screen_proxy(screen, origin, direction, distance, px, py, z_self[lane], lod)
+    else:
+        color, w, confidence = screen_march(screen, origin, direction, query.blur[lane])
+    _, w = update_headroom(1.0 - _headroom(query, lane), w)
+    _add(query, lane, SCREEN, color, w, confidence)
+
+
+@inlined
+def _ask_probes(query, lane, hdrp, probes, thing_probe, world, sky_follows):  # type: ignore[no-untyped-def]
+    """Every probe that reaches the ray's origin, in order; then the one that is the thing's own."""
+    p = row(query.origin, lane)
+    cuts, sets = probes.reach.cuts, probes.reach.sets
+    i, j, l = piece_of(cuts, 0, p[0]), piece_of(cuts, 1, p[1]), piece_of(cuts, 2, p[2])  # noqa: E741
+    k = next_of(sets, i, j, l, 0)
+    while k >= 0 and _headroom(query, lane) > 1.0 - _SPENT:
+        _ask_probe(query, lane, k, hdrp, probes, world, sky_follows)
+        k = next_of(sets, i, j, l, k + 1)
+    own = thing_probe[query.thing[lane]]
+    if own >= 0 and probes.owned[own] != 0 and _headroom(query, lane) > 1.0 - _SPENT:
+        _ask_probe(query, lane, own, hdrp, probes, world, sky_follows)
+
+
+@inlined
+def _ask_probe(query, lane, k, hdrp, probes, world, sky_follows):  # type: ignore[no-untyped-def]
+    origin, direction, n = row(query.origin, lane), row(query.direction, lane), row(query.normal, lane)
+    w = influence(probes, k, origin, n, direction)
+    if w <= 0.0:
+        return
+    light, coverage, fits, confidence = probe_light(
+        probes, k, origin, direction, query.blur[lane], query.roughness[lane], hdrp, world.environment,
+        sky_follows and world.environment.present,
+    )  # fmt: skip
+    # The colour carries its own coverage; only the covered share of the weight is used up.
+    _, w = update_headroom(1.0 - _headroom(query, lane), w * fits)
+    for c in range(3):
+        query.color[lane, c] += light[c] * w
+    w *= coverage
+    query.weight[lane, PROBE] += w
+    query.weight[lane, NONE] -= w
+    query.confidence[lane] += w * confidence
+
+
+@inlined
+def _ask_rays(query, embedded, block, second, third, packet, world, sample):  # type: ignore[no-untyped-def]
+    """One ray into the opaque scene for every lane with weight left; `embedded` lanes only, or all."""
+    clear(packet)
+    some = False
+    for lane in range(LANES):
+        if query.on[lane] == 0 or _headroom(query, lane) <= 1.0 - _SPENT:
+            continue
+        if embedded and query.embedded[lane] == 0:
+            continue
+        some = True
+        d = row(query.direction, lane)
+        x, y = block.pixel[lane, 0], block.pixel[lane, 1]
+        if query.blur[lane] > 0.0:
+            u1, u2 = unit_pair(x, y, sample, _ROUGH_RAY)
+            d = _scatter(d, query.blur[lane], u1, u2)
+        second.pixel[lane, 0], second.pixel[lane, 1] = x + 104729, y
+        third.scratch[0, lane] = math.inf
+        set_ray(packet, lane, row(query.origin, lane), d, 0.0, math.inf, OPAQUE)
+    if not some:
+        return
+    intersect_world(packet, world, third.scratch[0], SCATTERED)
+    load_hits(second, packet, world, 0.0)
+    shade(second, third, packet, world, sample, OPAQUE)
+    for lane in range(LANES):
+        if second.on[lane] != 0:
+            _add(query, lane, RAY, row(second.color, lane), _headroom(query, lane), 1.0)
+
+
+@inlined
+def _scatter(d, blur, u1, u2):  # type: ignore[no-untyped-def]
+    """A direction of the rough lobe around `d`: GGX slopes of width `blur`, cut at 85 degrees."""
+    x, y = frame(d)
+    slope = min(11.0, blur * math.sqrt(u1 / max(1e-6, 1.0 - u1)))
+    phi = 2.0 * math.pi * u2
+    return normalize(add(d, add(scale(x, slope * math.cos(phi)), scale(y, slope * math.sin(phi)))))
+
+

@@ -1,0 +1,133 @@
+"""RefractMaterialAPI written on materials, in a layer over their stage or in a flat copy of it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdUtils
+
+from ...scene import Notice
+from ..layers.edit import outer_of, words_of
+from ..layers.write import RECORD, overlay
+from ..materials.read import API
+from ..stage import open_stage, stage_unit, time_range
+
+MADE = "convert"
+"""What `write` records of who made a layer."""
+
+
+class Work(NamedTuple):
+    """A stage to look at, and the layer to write what is added to it."""
+
+    stage: Usd.Stage
+    layer: Sdf.Layer
+    time: Usd.TimeCode
+    unit: float
+    """Metres per scene unit."""
+    notices: tuple[Notice, ...]
+    """What is missing from the stage, or was lost when it was made flat."""
+
+
+class Addition(NamedTuple):
+    """What is added to one prim."""
+
+    path: str
+    applies: bool
+    """RefractMaterialAPI is applied."""
+    values: dict[str, Any]
+    """Attribute -> value: a token, a float or a colour, by the type that the schema gives it."""
+    connections: dict[str, str]
+    """Attribute -> path of the output that drives it."""
+
+
+def begin(path: str, *, flatten: bool) -> Work:
+    """Open a stage for conversion.
+
+    Args:
+        flatten: everything is composed into one layer, where instances can be reached too; else a layer on top.
+
+    Raises:
+        StageError: the stage cannot be opened.
+    """
+    stage = open_stage(path)
+    notices = []
+    if errors := stage.GetCompositionErrors():
+        text = f"{len(errors)} parts of the stage cannot be composed, such as: {' '.join(str(errors[0]).split())}"
+        notices.append(Notice(path, text))
+    if flatten:
+        layer, lost = _flat(stage)
+        notices += [Notice(path, f"USD says: {text}") for text in lost]
+        stage = Usd.Stage.Open(layer)
+    else:
+        layer = overlay(path, made=MADE)
+    layer.customLayerData = {**layer.customLayerData, RECORD: origin(path)}
+    return Work(stage, layer, Usd.TimeCode(time_range(stage)[0]), stage_unit(stage, notices), tuple(notices))
+
+
+def origin(path: str) -> dict[str, str]:
+    """What a converted layer tells of where it comes from: no folder, as it may travel far from its stage."""
+    outer = outer_of(path)
+    return {"made": MADE, "stage": os.path.basename(outer) + path[len(outer) :]}
+
+
+def _flat(stage: Usd.Stage) -> tuple[Sdf.Layer, list[str]]:
+    """One layer with everything, and what USD says about that."""
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()
+    layer = stage.Flatten(addSourceFileComment=False)  # it would name folders of this machine
+    said = [words_of(one) for one in delegate.TakeUncoalescedDiagnostics()]
+    return layer, list(dict.fromkeys(said))
+
+
+_TYPES = {
+    "refraction:model": Sdf.ValueTypeNames.Token,
+    "inputs:refraction:ior": Sdf.ValueTypeNames.Float,
+    "inputs:refraction:thickness": Sdf.ValueTypeNames.Float,
+    "inputs:refraction:transmittanceColor": Sdf.ValueTypeNames.Color3f,
+    "inputs:refraction:absorptionDistance": Sdf.ValueTypeNames.Float,
+    "inputs:refraction:abbeNumber": Sdf.ValueTypeNames.Float,
+    "primvars:refraction:thickness": Sdf.ValueTypeNames.Float,
+}
+
+
+def add(layer: Sdf.Layer, additions: Iterable[Addition]) -> None:
+    """Author the additions. Sdf knows no schemas: the layer is the same with or without ours registered."""
+    with Sdf.ChangeBlock():
+        for addition in additions:
+            spec = Sdf.CreatePrimInLayer(layer, addition.path)
+            if addition.applies:
+                _apply(spec)
+            for name, value in addition.values.items():
+                _attribute(spec, name).default = _typed(name, value)
+            for name, source in addition.connections.items():
+                _attribute(spec, name).connectionPathList.explicitItems = [Sdf.Path(source)]
+
+
+def _apply(spec: Sdf.PrimSpec) -> None:
+    """Put the schema in front of those that the spec applies already."""
+    known = spec.GetInfo("apiSchemas") if spec.HasInfo("apiSchemas") else Sdf.TokenListOp()
+    if known.isExplicit:
+        items = Sdf.TokenListOp.CreateExplicit([API, *(name for name in known.explicitItems if name != API)])
+    else:
+        items = Sdf.TokenListOp()
+        items.prependedItems = [API, *(name for name in known.prependedItems if name != API)]
+        items.appendedItems = known.appendedItems
+        items.deletedItems = [name for name in known.deletedItems if name != API]
+    spec.SetInfo("apiSchemas", items)
+
+
+def _attribute(spec: Sdf.PrimSpec, name: str) -> Sdf.AttributeSpec:
+    known = spec.attributes.get(name)
+    if known:
+        return known
+    uniform = Sdf.VariabilityUniform if name == "refraction:model" else Sdf.VariabilityVarying
+    attribute = Sdf.AttributeSpec(spec, name, _TYPES[name], uniform)
+    if name.startswith("primvars:"):
+        attribute.SetInfo("interpolation", UsdGeom.Tokens.constant)
+    return attribute
+
+
+def _typed(name: str, value: Any) -> Any:
+    kind = _TYPES[name]
+    return Gf.Vec3f(*value) if kind == Sdf.ValueTypeNames.Color3f else value

@@ -1,0 +1,252 @@
+"""The nearest standard surface written back on refractive materials, so that other renderers show something sensible.
+
+Nothing that is authored is changed: an own shader is made where the material has none for its output, and what an
+existing one of the same kind leaves open is filled in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+from pxr import Gf, Sdf, Usd, UsdShade
+
+from ...scene import Material, Model, Notice, Param, Source, Texture
+from ..materials.read import read_material
+from ..materials.sources import is_constant
+from ..stage import stage_unit, time_range
+from .find import editable
+
+
+class _Target(NamedTuple):
+    """One kind of standard surface."""
+
+    identifier: str
+    context: str
+    """Render context of the output it stands on; '' is the universal one."""
+    output: str
+    prim: str
+    """Name of a new shader."""
+
+
+_TARGETS = {
+    "preview": _Target("UsdPreviewSurface", "", "surface", "RefractPreview"),
+    "openpbr": _Target("ND_open_pbr_surface_surfaceshader", "mtlx", "out", "RefractOpenPBR"),
+    "gltf": _Target("ND_gltf_pbr_surfaceshader", "mtlx", "out", "RefractGltf"),
+}
+_KINDS = {float: Sdf.ValueTypeNames.Float, bool: Sdf.ValueTypeNames.Bool, tuple: Sdf.ValueTypeNames.Color3f}
+_Inputs = dict[str, Any]
+
+
+def write_surfaces(layer: Sdf.Layer, target: str, paths: Iterable[str]) -> dict[str, tuple[str, ...]]:
+    """Author the surfaces in a layer over a stage, or in a flat one.
+
+    Args:
+        layer: what is to be written; RefractMaterialAPI is in it already.
+        target: preview, openpbr or gltf.
+        paths: materials.
+
+    Returns:
+        What was done, or why nothing, by material.
+    """
+    stage = Usd.Stage.Open(layer)
+    time = Usd.TimeCode(time_range(stage)[0])
+    unit = stage_unit(stage, [])
+    textures: dict[str, Texture] = {}
+    told = {}
+    for path in paths:
+        material = UsdShade.Material(stage.GetPrimAtPath(path))
+        notices: list[Notice] = []
+        record = read_material(
+            material, time, metres_per_unit=unit, closed=True, textures=textures, notices=notices
+        )  # fmt: skip
+        told[path] = tuple(_write(material, record, _TARGETS[target], unit))
+    return told
+
+
+def _write(material: UsdShade.Material, record: Material, target: _Target, unit: float) -> Iterable[str]:
+    where = f"outputs:{target.context + ':' if target.context else ''}surface"
+    place = editable(material.GetPrim())
+    if record.model is Model.NONE or place is None:
+        yield f"no {target.identifier} is written: " + (
+            "it is out of reach" if place is None else "it refracts nothing"
+        )
+        return
+    essential, rest = _MAKERS[target.identifier](record, unit)
+    existing, taken = _existing(material, target)
+    if existing is not None:
+        yield from _fill(existing, essential, target)
+    elif taken:
+        yield f"no {target.identifier} is written: {where} is {taken} already"
+    elif mapped := _mapped(record, target):
+        yield f"no {target.identifier} is written: {', '.join(mapped)} is mapped, which is not carried over"
+    else:
+        home = UsdShade.Material(material.GetPrim().GetStage().GetPrimAtPath(place))
+        shader = _make(home, target)
+        for name, value in {**rest, **essential}.items():
+            shader.CreateInput(name, _KINDS[type(value)]).Set(_value(value))
+        yield f"{target.identifier} is written on {where}"
+
+
+def _existing(material: UsdShade.Material, target: _Target) -> tuple[UsdShade.Shader | None, str]:
+    """The shader of this kind on the output; else the name of what else stands there, or ''."""
+    output = material.GetSurfaceOutput(target.context) if target.context else material.GetSurfaceOutput()
+    if not output or not output.GetAttr().HasAuthoredConnections():
+        return None, ""
+    shader = material.ComputeSurfaceSource(target.context)[0]
+    if shader and shader.GetShaderId() == target.identifier:
+        return shader, ""
+    return None, f"{shader.GetShaderId() or 'another shader'}" if shader else "connected"
+
+
+def _make(material: UsdShade.Material, target: _Target) -> UsdShade.Shader:
+    name, count = target.prim, 1
+    while material.GetPrim().GetChild(name):
+        name, count = f"{target.prim}_{count}", count + 1
+    shader = UsdShade.Shader.Define(material.GetPrim().GetStage(), material.GetPath().AppendChild(name))
+    shader.CreateIdAttr(target.identifier)
+    made = shader.CreateOutput(target.output, Sdf.ValueTypeNames.Token)
+    output = material.CreateSurfaceOutput(target.context) if target.context else material.CreateSurfaceOutput()
+    output.ConnectToSource(made)
+    return shader
+
+
+def _fill(shader: UsdShade.Shader, essential: _Inputs, target: _Target) -> Iterable[str]:
+    """Author what is left open; name what is authored otherwise and stays."""
+    place = editable(shader.GetPrim())
+    if place is None:
+        yield f"{shader.GetPath()} is out of reach"
+        return
+    written, stays = [], []
+    for name, value in essential.items():
+        port = shader.GetInput(name)
+        made = port.GetValueProducingAttributes() if port else []
+        if not made:
+            at = UsdShade.Shader(shader.GetPrim().GetStage().GetPrimAtPath(place))
+            at.CreateInput(name, _KINDS[type(value)]).Set(_value(value))
+            written.append(name)
+        elif UsdShade.Output.IsOutput(made[0]) or not _same(made[0].Get(), value):
+            stays.append(name)
+    if written:
+        yield f"{target.identifier} gets {', '.join(written)}"
+    if stays:
+        yield f"{target.identifier} keeps its own {', '.join(stays)}"
+
+
+def _same(found: Any, wanted: Any) -> bool:
+    a = tuple(found) if isinstance(wanted, tuple) and found is not None else (found,)
+    b = wanted if isinstance(wanted, tuple) else (wanted,)
+    return len(a) == len(b) and all(
+        x is not None and abs(float(x) - float(y)) <= 1.0e-5 for x, y in zip(a, b, strict=True)
+    )
+
+
+def _value(value: Any) -> Any:
+    return Gf.Vec3f(*value) if isinstance(value, tuple) else value
+
+
+# --- inputs ---------------------------------------------------------------------------------------------------------
+
+
+def _mapped(record: Material, target: _Target) -> list[str]:
+    """Names of the inputs that a picture or primvar drives and that show in this kind of surface."""
+    shown = {Param.IOR, Param.ROUGHNESS, Param.OPACITY, Param.NORMAL, Param.EMISSIVE, Param.METALLIC}
+    shown |= {Param.CLEARCOAT, Param.CLEARCOAT_ROUGHNESS}
+    if target.context:
+        shown.add(Param.TRANSMITTANCE)
+    if record.inputs[Param.OPACITY].value[0] > 0.0 or not is_constant(record.inputs[Param.OPACITY]):
+        shown |= {Param.DIFFUSE, Param.OCCLUSION}
+    return [param.name.lower() for param in sorted(shown) if not is_constant(record.inputs[param])]
+
+
+def _one(record: Material, param: Param) -> float:
+    return _neat(record.inputs[param].value[0])
+
+
+def _three(source: Source) -> tuple[float, float, float]:
+    r, g, b = (_neat(value) for value in source.value[:3])
+    return r, g, b
+
+
+def _neat(value: float) -> float:
+    return float(f"{value:.6g}")
+
+
+def _body(record: Material, emission: str, coat: str, coat_roughness: str) -> _Inputs:
+    """What a surface has beside its glass."""
+    found: _Inputs = {}
+    if (emitted := _three(record.inputs[Param.EMISSIVE])) != (0.0, 0.0, 0.0):
+        found[emission] = emitted
+    if (coated := _one(record, Param.CLEARCOAT)) > 0.0:
+        found |= {coat: coated, coat_roughness: _one(record, Param.CLEARCOAT_ROUGHNESS)}
+    return found
+
+
+def _base(record: Material, clear: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> tuple[float, float, float]:
+    """The colour of what is not transmitted; `clear` where all is, which in white disturbs no renderer."""
+    opaque = record.inputs[Param.OPACITY].value[0] > 0.0
+    return _three(record.inputs[Param.DIFFUSE]) if opaque else clear
+
+
+def _preview(record: Material, unit: float) -> tuple[_Inputs, _Inputs]:
+    opacity = _one(record, Param.OPACITY)
+    tint = _three(record.inputs[Param.TRANSMITTANCE])
+    rest: _Inputs = {
+        "diffuseColor": _base(record, tint),
+        "metallic": _one(record, Param.METALLIC),
+        "roughness": _one(record, Param.ROUGHNESS),
+    }
+    rest |= _body(record, "emissiveColor", "clearcoat", "clearcoatRoughness")
+    return {"opacity": opacity, "ior": _one(record, Param.IOR)}, rest
+
+
+def _open_pbr(record: Material, unit: float) -> tuple[_Inputs, _Inputs]:
+    thin = record.model is Model.THIN
+    glass: _Inputs = {
+        "transmission_weight": _neat(1.0 - _one(record, Param.OPACITY)),
+        "specular_ior": _one(record, Param.IOR),
+        "transmission_color": _three(record.inputs[Param.TRANSMITTANCE]),
+        "transmission_depth": 0.0 if thin else _neat(record.absorption_distance / unit),
+        "geometry_thin_walled": thin,
+    }
+    if record.abbe > 0.0:
+        glass |= {"transmission_dispersion_scale": 1.0, "transmission_dispersion_abbe_number": _neat(record.abbe)}
+    rest: _Inputs = {
+        "base_color": _base(record),
+        "base_metalness": _one(record, Param.METALLIC),
+        "specular_roughness": _one(record, Param.ROUGHNESS),
+    }
+    rest |= _body(record, "emission_color", "coat_weight", "coat_roughness")
+    if "emission_color" in rest:
+        rest["emission_luminance"] = 1.0
+    return glass, rest
+
+
+def _gltf(record: Material, unit: float) -> tuple[_Inputs, _Inputs]:
+    thin = record.model is Model.THIN
+    tint = _three(record.inputs[Param.TRANSMITTANCE])
+    glass: _Inputs = {
+        "transmission": _neat(1.0 - _one(record, Param.OPACITY)),
+        "ior": _one(record, Param.IOR),
+        # A wall without thickness has no volume; its colour is the base colour.
+        "thickness": 0.0 if thin else _neat(record.inputs[Param.THICKNESS].value[0] / unit),
+    }
+    if not thin and tint != (1.0, 1.0, 1.0):
+        glass |= {"attenuation_color": tint, "attenuation_distance": _neat(record.absorption_distance / unit)}
+    if record.abbe > 0.0:
+        glass["dispersion"] = _neat(20.0 / record.abbe)
+    rest: _Inputs = {
+        # One colour for both: where some of the surface is left, other renderers tint the glass with it too.
+        "base_color": _base(record, tint) if thin else _base(record),
+        "metallic": _one(record, Param.METALLIC),
+        "roughness": _one(record, Param.ROUGHNESS),
+    }
+    rest |= _body(record, "emissive", "clearcoat", "clearcoat_roughness")
+    return glass, rest
+
+
+_MAKERS = {
+    "UsdPreviewSurface": _preview,
+    "ND_open_pbr_surface_surfaceshader": _open_pbr,
+    "ND_gltf_pbr_surfaceshader": _gltf,
+}

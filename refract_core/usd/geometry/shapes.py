@@ -1,0 +1,319 @@
+"""One prim with a surface as triangles in its own space, checked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Usd, UsdGeom
+
+from ...scene import F32, F64, U32, Notice
+from . import gprims
+from .primvars import Corners, Topology, Unusable, as_values, evaluate, to_corners
+from .triangulate import Index, Triangles, fans, fans_fit, is_closed, smooth_normals, triangulate, turned_over
+
+SUBDIVIDED = (UsdGeom.Tokens.catmullClark, UsdGeom.Tokens.loop)
+_MESH_ATTRIBUTES = ("points", "faceVertexCounts", "faceVertexIndices", "holeIndices", "normals")
+_LARGEST = 1.0e15
+"""Coordinates beyond it are taken for garbage: their squares still fit float32."""
+_IDENTITY = np.eye(4)
+_SMALL = 512
+"""Face corners up to which a topology is kept: many small meshes are the same few shapes."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The triangles of one prim."""
+
+    points: F32
+    """shape (V, 3), in shape space"""
+    triangles: U32
+    """shape (T, 3), counter-clockwise seen from outside"""
+    normals: Corners | None = None
+    """Unit normals, or None: flat"""
+    topology: Topology | None = None
+    """None on gprims, where only constant primvars are defined."""
+    natural: dict[str, Corners] = field(default_factory=dict)
+    """Primvars a gprim has by its nature, used where the stage authors none of that name."""
+    prim_from_shape: F64 = field(default_factory=lambda: _IDENTITY)
+    """shape (4, 4), column vectors"""
+    closed: bool = False
+    double_sided: bool = False
+    varying: bool = False
+    """The geometry changes in time."""
+    is_sphere: bool = False
+    """Shape space holds the unit sphere about the origin."""
+    cage: bool = False
+    """The control cage of a subdivision surface."""
+
+
+def read_shape(prim: Usd.Prim, time: Usd.TimeCode, notices: list[Notice]) -> Shape | None:
+    """Triangles of a Mesh or gprim at a time; None, with a notice that says why, where nothing is left to draw."""
+    is_mesh = prim.GetTypeName() == "Mesh"
+    try:
+        shape = _read_mesh(UsdGeom.Mesh(prim), time, notices) if is_mesh else _read_gprim(prim, time)
+    except Unusable as reason:
+        notices.append(Notice(str(prim.GetPath()), f"skipped: {reason}"))
+        return None
+    return shape
+
+
+def _varies(prim: Usd.Prim, names: tuple[str, ...]) -> bool:
+    authored = prim.GetAuthoredPropertyNames()
+    return any(name in authored and prim.GetAttribute(name).ValueMightBeTimeVarying() for name in names)
+
+
+def _read_gprim(prim: Usd.Prim, time: Usd.TimeCode) -> Shape:
+    gprim = gprims.read_gprim(prim, time)
+    return Shape(
+        points=gprim.solid.points,
+        triangles=gprim.solid.triangles,
+        normals=gprim.solid.normals,
+        natural={"st": gprim.solid.st},
+        prim_from_shape=gprim.prim_from_solid,
+        closed=gprim.solid.closed,
+        double_sided=bool(UsdGeom.Gprim(prim).GetDoubleSidedAttr().Get(time)),
+        varying=_varies(prim, gprims.ATTRIBUTES[prim.GetTypeName()]),
+        is_sphere=gprim.is_sphere,
+    )
+
+
+@dataclass(frozen=True)
+class _Faces:
+    """The faces of a mesh that can be used."""
+
+    points: F32
+    indices: Index
+    starts: Index
+    counts: Index
+    faces: Index
+    """shape (F,): their numbers among all faces of the prim"""
+    total: int
+    """Faces of the prim, good or bad"""
+    corner_total: int
+    """Face corners of the prim, good or bad"""
+    faults: dict[str, int]
+    """What was left out, and how many"""
+    known: _Topology | None = None
+    """What was found out already about a mesh of the same topology"""
+
+
+class _Topology(NamedTuple):
+    """Counts and indices with nothing wrong in them, and what follows from them alone."""
+
+    counts: Index
+    indices: Index
+    starts: Index
+    faces: Index
+    cut: Triangles
+    """Every polygon as a fan from its first corner"""
+    vertices: Index
+    """shape (T, 3): the points of `cut`"""
+    loops: tuple[Index, ...]
+    """Corners of the polygons, shape (F, n) for each n"""
+    used: int
+    """Points in use: these are the first so many"""
+    closed: bool
+    """By the indices alone"""
+
+
+@lru_cache(maxsize=1024)
+def _topology(count_bytes: bytes, index_bytes: bytes) -> _Topology | None:
+    """A small mesh's topology; None where some polygon or index needs a closer look."""
+    counts, indices = np.frombuffer(count_bytes, np.int64), np.frombuffer(index_bytes, np.int64)
+    used = int(indices.max()) + 1 if len(indices) else 0
+    if counts.min() < 3 or counts.sum() != len(indices) or not np.array_equal(np.unique(indices), np.arange(used)):
+        return None
+    starts = np.cumsum(counts) - counts
+    cut, loops = fans(starts, counts)
+    closed = is_closed(np.zeros((1, 3), np.float32), indices, starts, counts)
+    return _Topology(counts, indices, starts, np.arange(len(counts)), cut, indices[cut.corners], loops, used, closed)
+
+
+def _read_mesh(mesh: UsdGeom.Mesh, time: Usd.TimeCode, notices: list[Notice]) -> Shape:
+    faces = _usable_faces(mesh, time)
+    cut = _cut(faces, str(mesh.GetPath()), notices)
+    left_handed = mesh.GetOrientationAttr().Get(time) == UsdGeom.Tokens.leftHanded
+    corners = turned_over(cut.corners) if left_handed else cut.corners
+    known = faces.known
+    if known is not None and corners is known.cut.corners:
+        vertices = known.vertices
+        points, triangles = faces.points, vertices
+    else:
+        vertices = faces.indices[corners]
+        points, triangles = _compact(faces.points, vertices)
+    topology = Topology(corners, vertices, cut.faces, faces.corner_total, len(faces.points), faces.total)
+    cage = mesh.GetSubdivisionSchemeAttr().Get(time) in SUBDIVIDED
+    if cage:
+        normals: Corners | None = Corners(smooth_normals(points, triangles), triangles)
+    else:
+        normals = _authored_normals(mesh, time, topology, notices)
+    return Shape(
+        points=points,
+        triangles=np.ascontiguousarray(triangles, np.uint32),
+        normals=_mended(normals, points, triangles),
+        topology=topology,
+        closed=(known is not None and known.closed)
+        or is_closed(faces.points, faces.indices, faces.starts, faces.counts),
+        double_sided=bool(mesh.GetDoubleSidedAttr().Get(time)),
+        varying=_varies(mesh.GetPrim(), _MESH_ATTRIBUTES),
+        cage=cage,
+    )
+
+
+def _cut(faces: _Faces, path: str, notices: list[Notice]) -> Triangles:
+    """Triangles with an area, and one notice about everything that is not drawn.
+
+    Raises:
+        Unusable: where none is left.
+    """
+    if faces.known is not None and fans_fit(faces.points, faces.indices, faces.known.loops):
+        return faces.known.cut
+    cut = triangulate(faces.points, faces.indices, faces.starts, faces.counts, faces.faces)
+    drawn = np.bincount(cut.faces, minlength=faces.total)[faces.faces] > 0
+    faults = dict(faces.faults)
+    if flat := int((~drawn).sum()):
+        faults["faces without area"] = flat
+    listed = ", ".join(f"{count} {what}" for what, count in faults.items()) or "all are holes"
+    if not len(cut.faces):
+        raise Unusable(f"none of its {faces.total} faces can be drawn: {listed}")
+    if faults:
+        text = f"not everything in its {faces.total} faces can be used; left out: {listed}"
+        notices.append(Notice(path, text))
+    return cut
+
+
+def _integers(value: Any) -> Index:
+    return np.zeros(0, np.int64) if value is None else np.asarray(value, np.int64)
+
+
+def _usable_faces(mesh: UsdGeom.Mesh, time: Usd.TimeCode) -> _Faces:
+    """Reads the topology and leaves out what cannot be drawn.
+
+    Raises:
+        Unusable: where there are no points or faces, or a count is negative, so that no face can be told from another.
+    """
+    values = as_values(mesh.GetPointsAttr().Get(time))
+    counts = _integers(mesh.GetFaceVertexCountsAttr().Get(time))
+    indices = _integers(mesh.GetFaceVertexIndicesAttr().Get(time))
+    if values is None or not len(values) or values.shape[1] != 3:
+        raise Unusable("it has no points at this time")
+    if not len(counts):
+        raise Unusable("it has no faces at this time")
+    holes = _integers(mesh.GetHoleIndicesAttr().Get(time))
+    if len(indices) <= _SMALL and not len(holes):
+        known = _topology(counts.tobytes(), indices.tobytes())
+        if known is not None and known.used == len(values) and _tame(values):
+            shared = known.indices, known.starts, known.counts, known.faces
+            return _Faces(values, *shared, len(counts), len(indices), {}, known)
+    if counts.min() < 0:
+        raise Unusable(f"faceVertexCounts has {int((counts < 0).sum())} negative values")
+    ends = np.cumsum(counts)
+    starts = ends - counts
+    if counts.min() >= 3 and ends[-1] == len(indices) and not len(holes) and _sound(values, indices):
+        return _Faces(values, indices, starts, counts, np.arange(len(counts)), len(counts), len(indices), {})
+    faults: dict[str, int] = {}
+    usable = np.ones(len(counts), bool)
+    _exclude(usable, counts >= 3, "faces with fewer than 3 vertices", faults)
+    text = f"faces whose faceVertexCounts go beyond the {len(indices)} faceVertexIndices"
+    _exclude(usable, ends <= len(indices), text, faults)
+    if ends[-1] < len(indices):
+        faults["faceVertexIndices that belong to no face"] = int(len(indices) - ends[-1])
+    wrong = (indices < 0) | (indices >= len(values))
+    outside = _any_of_face(wrong, starts, counts)
+    _exclude(usable, ~outside, f"faces with indices outside 0 .. {len(values) - 1}", faults)
+    wild = ~np.all(np.abs(values) <= _LARGEST, axis=1)
+    if wild.any():
+        bad = _any_of_face(wild[np.where(wrong, 0, indices)], starts, counts)
+        _exclude(usable, ~bad, "faces with points that are NaN, infinite or over 1e15", faults)
+    named = (holes >= 0) & (holes < len(counts))
+    if not named.all():
+        faults["holeIndices that name no face"] = int((~named).sum())
+    usable[holes[named]] = False
+    faces = np.flatnonzero(usable)
+    return _Faces(values, indices, starts[faces], counts[faces], faces, len(counts), len(indices), faults)
+
+
+def _sound(points: F32, indices: Index) -> bool:
+    """Nothing wrong with any of them."""
+    return bool(indices.min() >= 0 and indices.max() < len(points)) and _tame(points)
+
+
+def _tame(points: F32) -> bool:
+    """No NaN, no infinity, nothing beyond `_LARGEST`."""
+    return bool(points.min() >= -_LARGEST and points.max() <= _LARGEST)
+
+
+def _exclude(usable: NDArray[np.bool_], good: NDArray[np.bool_], why: str, faults: dict[str, int]) -> None:
+    """Takes the faces that are not `good` out of `usable` and counts those that were still in."""
+    if count := int((usable & ~good).sum()):
+        faults[why] = count
+    usable &= good
+
+
+def _any_of_face(corner_flags: NDArray[np.bool_], starts: Index, counts: Index) -> NDArray[np.bool_]:
+    """Whether a flag is set at any corner of each face; corners that do not exist have none."""
+    if not corner_flags.any():
+        return np.zeros(len(counts), bool)
+    running = np.concatenate(([0], np.cumsum(corner_flags)))
+    last = len(corner_flags)
+    found: NDArray[np.bool_] = running[np.minimum(starts + counts, last)] > running[np.minimum(starts, last)]
+    return found
+
+
+def _compact(points: F32, vertices: Index) -> tuple[F32, Index]:
+    """Without the points no triangle uses."""
+    used = np.zeros(len(points), bool)
+    used[vertices.ravel()] = True
+    if used.all():
+        return points, vertices
+    return points[used], (np.cumsum(used) - 1)[vertices]
+
+
+def _authored_normals(
+    mesh: UsdGeom.Mesh, time: Usd.TimeCode, topology: Topology, notices: list[Notice]
+) -> Corners | None:
+    """`primvars:normals`, else `normals`."""
+    path = str(mesh.GetPath())
+    attribute = mesh.GetPrim().GetAttribute("primvars:normals")
+    primvar = UsdGeom.Primvar(attribute) if attribute else None
+    try:
+        if primvar and primvar.HasValue():
+            normals = evaluate(primvar, time, topology)
+        else:
+            values = as_values(mesh.GetNormalsAttr().Get(time))
+            if values is None or not len(values):
+                return None
+            normals = to_corners(values, None, mesh.GetNormalsInterpolation(), topology)
+        if normals is None or normals.values.shape[1] != 3:
+            raise Unusable("they are not vectors of 3")
+    except Unusable as reason:
+        notices.append(Notice(path, f"the attribute normals is ignored and flat shading used: {reason}"))
+        return None
+    if normals.rows is None:
+        return Corners(normals.values, np.zeros(topology.corners.shape, np.int64))
+    return normals
+
+
+def _mended(normals: Corners | None, points: F32, triangles: Index) -> Corners | None:
+    """Unit normals; where one is zero or NaN, that of the triangle."""
+    if normals is None or normals.rows is None:
+        return None
+    lengths = np.sqrt((normals.values.astype(np.float64) ** 2).sum(axis=1))
+    bad = ~(np.isfinite(lengths) & (lengths > 0.0))
+    lengths[bad] = 1.0
+    unit = (normals.values / lengths[:, None]).astype(np.float32)
+    if not bad.any():
+        return Corners(unit, normals.rows)
+    unit[bad] = (0.0, 0.0, 1.0)  # no corner takes it any more
+    at = bad[normals.rows]
+    rows = np.flatnonzero(at.any(axis=1))
+    around = points[triangles[rows]].astype(np.float64)
+    flat = np.cross(around[:, 1] - around[:, 0], around[:, 2] - around[:, 0])
+    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+    picks = normals.rows.copy()
+    picks[rows] = np.where(at[rows], len(unit) + np.arange(len(rows))[:, None], picks[rows])
+    return Corners(np.concatenate((unit, flat.astype(np.float32))), picks)

@@ -1,0 +1,218 @@
+"""Which prims of a stage are seen, and where: visibility, purpose, transforms, native and point instances."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom
+
+from ...errors import StageError
+from ...scene import F64, Notice
+from .gprims import ATTRIBUTES
+from .triangulate import Index
+
+MAX_INSTANCES = 100_000
+"""Prims that point instancers may stand for, in all."""
+MAX_PRIMS = 4_000_000
+"""Prims looked at, native instances expanded."""
+
+DRAWN = frozenset({"Mesh", *ATTRIBUTES})
+_EVERYTHING = Usd.TraverseInstanceProxies()
+# Prototypes of a point instancer are often `over` or `class` prims, so that nothing else draws them.
+_PROTOTYPES = Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)
+_INSTANCER_ATTRIBUTES = ("protoIndices", "positions", "orientations", "orientationsf", "scales", "invisibleIds")
+
+
+class Placement(NamedTuple):
+    """One prim at one place."""
+
+    prim: Usd.Prim
+    path: str
+    """Where it is drawn; `/Instancer/[7]/Proto/Mesh` for what instance 7 of a point instancer draws."""
+    world_from_prim: F64
+    """shape (4, 4), column vectors, in the stage's own world and units"""
+    static: bool
+    """Nothing that moves it varies in time, and `primvars:refract:static` is not 0."""
+    instance: tuple[Usd.Prim, int] | None = None
+    """The innermost point instancer and the index in it."""
+
+
+class _Node(NamedTuple):
+    prim: Usd.Prim
+    world: Gf.Matrix4d
+    """What its own transform is relative to; row vectors."""
+    purpose: UsdGeom.Imageable.PurposeInfo
+    static: bool
+
+
+@dataclass
+class _Walk:
+    time: Usd.TimeCode
+    purposes: frozenset[str]
+    notices: list[Notice]
+    cache: UsdGeom.XformCache
+    unsupported: dict[str, list[str]] = field(default_factory=dict)
+    drawn_otherwise: list[str] = field(default_factory=list)
+    """Models whose draw mode asks for bounds, an origin or cards."""
+    visited: int = 0
+    expanded: int = 0
+    within: tuple[Sdf.Path, ...] = ()
+    """Point instancers being expanded, outermost first."""
+
+
+def walk(stage: Usd.Stage, time: Usd.TimeCode, purposes: tuple[str, ...], notices: list[Notice]) -> list[Placement]:
+    """Every visible prim with a surface, in the order of the stage.
+
+    Raises:
+        StageError: where instances expand to more than `MAX_INSTANCES` or `MAX_PRIMS` prims.
+    """
+    state = _Walk(time, frozenset(purposes), notices, UsdGeom.XformCache(time))
+    start = _Node(stage.GetPseudoRoot(), Gf.Matrix4d(1.0), UsdGeom.Imageable.PurposeInfo(), True)
+    found = list(_descend(state, start, _EVERYTHING, 0))
+    for kind, paths in sorted(state.unsupported.items()):
+        notices.append(Notice(paths[0], f"{kind} is not rendered; convert it to a Mesh ({some_of(paths)})"))
+    if state.drawn_otherwise:
+        text = f"model:drawMode is ignored, the geometry itself is drawn ({some_of(state.drawn_otherwise)})"
+        notices.append(Notice(state.drawn_otherwise[0], text))
+    return found
+
+
+def some_of(paths: list[str]) -> str:
+    """How many there are and the first few by name."""
+    first = ", ".join(paths[:3]) + (", ..." if len(paths) > 3 else "")
+    return f"{len(paths)} prim{'s' if len(paths) > 1 else ''}: {first}"
+
+
+def _descend(
+    state: _Walk, start: _Node, predicate: Usd._PrimFlagsPredicate, cut: int, *, placed: bool = False
+) -> Iterator[Placement]:
+    """`start` and what is below it.
+
+    Args:
+        cut: length of the path prefix that is left out of `Placement.path`
+        placed: the transform of `start` itself is already in `start.world`
+    """
+    stack = [start]
+    while stack:
+        node = stack.pop()
+        prim = node.prim
+        state.visited += 1
+        if state.visited > MAX_PRIMS:
+            raise StageError(f"{prim.GetPath()}: the stage has over {MAX_PRIMS} prims once its instances are expanded")
+        if prim.IsPseudoRoot():
+            stack.extend(_Node(child, *node[1:]) for child in reversed(prim.GetFilteredChildren(predicate)))
+            continue
+        if prim.HasAuthoredTypeName() and not prim.IsA(UsdGeom.Imageable):  # materials and the like: nothing to ask
+            stack.extend(_Node(child, *node[1:]) for child in reversed(prim.GetFilteredChildren(predicate)))
+            continue
+        if prim.GetAttribute("visibility").Get(state.time) == UsdGeom.Tokens.invisible:
+            continue
+        here = _enter(state, node, moves=not (placed and node is start))
+        label = str(prim.GetPath())[cut:]
+        if prim.IsA(UsdGeom.PointInstancer):
+            yield from _instances(state, here, label)
+            continue
+        if prim.IsA(UsdGeom.Gprim) and _wanted(state, here):
+            kind = str(prim.GetTypeName())
+            if kind in DRAWN:
+                yield Placement(prim, label, np.array(here.world).T, here.static)
+            else:
+                state.unsupported.setdefault(kind, []).append(label)
+        children = prim.GetFilteredChildren(predicate)
+        stack.extend(_Node(child, here.world, here.purpose, here.static) for child in reversed(children))
+
+
+def _enter(state: _Walk, node: _Node, *, moves: bool) -> _Node:
+    """What holds at the prim itself and is handed to its children."""
+    prim, world, purpose, static = node
+    imageable = UsdGeom.Imageable(prim)
+    if imageable:
+        purpose = imageable.ComputePurposeInfo(purpose)
+    xformable = UsdGeom.Xformable(prim)
+    if xformable and moves:
+        local, resets = state.cache.GetLocalTransformation(prim)
+        world = local if resets else local * world
+        static = static and not xformable.TransformMightBeTimeVarying()
+    mode = prim.GetAttribute("model:drawMode")
+    if mode and mode.Get(state.time) not in (None, UsdGeom.Tokens.default_, UsdGeom.Tokens.inherited):
+        state.drawn_otherwise.append(str(prim.GetPath()))
+    said = prim.GetAttribute("primvars:refract:static")
+    if said and said.HasAuthoredValue():
+        static = bool(said.Get(state.time)) and static
+    return _Node(prim, world, purpose, static)
+
+
+def _wanted(state: _Walk, node: _Node) -> bool:
+    return node.purpose.purpose in state.purposes or (not node.purpose.purpose and "default" in state.purposes)
+
+
+def _instances(state: _Walk, node: _Node, label: str) -> Iterator[Placement]:
+    """Everything a point instancer draws."""
+    prim, path = node.prim, node.prim.GetPath()
+    instancer = UsdGeom.PointInstancer(prim)
+    if path in state.within:
+        state.notices.append(Notice(str(path), "the instancer is among its own prototypes; it is not drawn there"))
+        return
+    numbers, prototypes, transforms = _placed_instances(state, instancer)
+    static = node.static and not any(prim.GetAttribute(n).ValueMightBeTimeVarying() for n in _INSTANCER_ATTRIBUTES)
+    outer, state.within = state.within, (*state.within, path)
+    world = np.array(node.world).T
+    for place, target in enumerate(instancer.GetPrototypesRel().GetForwardedTargets()):
+        chosen = np.flatnonzero(prototypes == place)
+        parts = _prototype(state, node, target, static, drawn=len(chosen))
+        for part in parts:
+            placed = world @ transforms[chosen] @ part.world_from_prim
+            for row, number in enumerate(numbers[chosen].tolist()):
+                where = f"{label}/[{number}]{part.path}"
+                yield Placement(part.prim, where, placed[row], part.static, part.instance or (prim, number))
+    state.within = outer
+
+
+def _prototype(state: _Walk, node: _Node, target: Sdf.Path, static: bool, *, drawn: int) -> list[Placement]:
+    """What one instance of a prototype draws, relative to the prototype; `drawn` instances of it are wanted."""
+    root = node.prim.GetStage().GetPrimAtPath(target)
+    if not root:
+        text = f"its prototype {target} does not exist; it draws nothing"
+        state.notices.append(Notice(str(node.prim.GetPath()), text))
+    if not root or not drawn:
+        return []
+    start = _Node(root, Gf.Matrix4d(1.0), node.purpose, static)
+    parts = list(_descend(state, start, _PROTOTYPES, len(str(target)) - len(target.name) - 1, placed=True))
+    state.expanded += len(parts) * drawn
+    if state.expanded > MAX_INSTANCES:
+        raise StageError(
+            f"{node.prim.GetPath()}: point instancers expand to {state.expanded} prims by here; at most "
+            f"{MAX_INSTANCES} can be rendered. Deactivate some instances or merge the prototype's meshes"
+        )
+    return parts
+
+
+def _placed_instances(state: _Walk, instancer: UsdGeom.PointInstancer) -> tuple[Index, Index, F64]:
+    """Number (N,), prototype (N,) and instancer_from_prototype (N, 4, 4) of every instance that is not masked out."""
+    path = instancer.GetPath()
+    nothing = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 4, 4))
+    prototypes = np.asarray(instancer.GetProtoIndicesAttr().Get(state.time) or [], np.int64)
+    if not len(prototypes):
+        state.notices.append(Notice(str(path), "the instancer has no protoIndices at this time; it draws nothing"))
+        return nothing
+    if len(prototypes) > MAX_INSTANCES:
+        raise StageError(
+            f"{path}: the instancer has {len(prototypes)} instances; at most {MAX_INSTANCES} can be rendered. "
+            "Deactivate some of them"
+        )
+    numbers = np.arange(len(prototypes))
+    if mask := instancer.ComputeMaskAtTime(state.time):
+        numbers = numbers[np.asarray(mask, bool)]
+    rows = np.asarray(instancer.ComputeInstanceTransformsAtTime(state.time, state.time), np.float64)
+    if len(rows) != len(numbers):
+        positions = len(instancer.GetPositionsAttr().Get(state.time) or [])
+        text = (
+            f"the instancer has {len(prototypes)} protoIndices but {positions} positions, or orientations, scales, ids "
+            "or prototypes that do not fit them; it draws nothing"
+        )
+        state.notices.append(Notice(str(path), text))
+        return nothing
+    return numbers, prototypes[numbers], rows.swapaxes(1, 2)

@@ -1,0 +1,349 @@
+"""UsdLux lights as the light table and the environment."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from pxr import Usd, UsdGeom, UsdLux
+
+from ...scene import F64, Environment, Light, LightKind, Notice
+from .domes import Dome, read_dome, rotation, sum_domes
+
+_KINDS = {
+    "DistantLight": LightKind.DISTANT,
+    "SphereLight": LightKind.SPHERE,
+    "RectLight": LightKind.RECT,
+    "DiskLight": LightKind.DISK,
+}
+_DOMES = ("DomeLight", "DomeLight_1")
+_KELVIN = (1000.0, 10000.0)
+
+
+class Context(NamedTuple):
+    """What every reader of one light needs."""
+
+    time: Usd.TimeCode
+    xforms: UsdGeom.XformCache
+    engine_from_stage: F64
+    metres_per_unit: float
+    notices: list[Notice]
+
+
+class Shape(NamedTuple):
+    """A light's place and size in engine world."""
+
+    world_from_light: F64
+    """shape (4, 4), rotation and translation [m]"""
+    size: tuple[float, float]
+    """As `scene.Light.size`."""
+    factor: float
+    """`radiance` per unit of emission, with `normalize` and the limit of a zero-size light in it."""
+
+
+def read_lights(
+    stage: Usd.Stage,
+    time: Usd.TimeCode,
+    *,
+    engine_from_stage: F64,
+    metres_per_unit: float,
+    purposes: tuple[str, ...],
+    notices: list[Notice],
+) -> tuple[tuple[Light, ...], Environment | None]:
+    """Every visible light of the stage.
+
+    Args:
+        stage: An opened stage.
+        time: Time code of the frame.
+        engine_from_stage: shape (4, 4), column vectors: stage world units to engine world metres.
+        metres_per_unit: The scale in it; areas for `normalize` are in stage units.
+        purposes: Purposes that are rendered.
+        notices: What was ignored, replaced or guessed is added here.
+
+    Returns:
+        Finite and distant lights in stage order, and all domes summed (None where there is none).
+    """
+    context = Context(time, UsdGeom.XformCache(time), engine_from_stage, metres_per_unit, notices)
+    lights: list[Light] = []
+    domes: list[Dome] = []
+    prims = iter(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
+    for prim in prims:
+        if prim.IsA(UsdGeom.PointInstancer):
+            _note_instanced(prim, notices)
+            prims.PruneChildren()
+        elif prim.HasAPI(UsdLux.LightAPI) and _shown(prim, time, purposes):
+            _read_light(context, prim, lights, domes)
+    return tuple(lights), sum_domes(domes)
+
+
+def _read_light(context: Context, prim: Usd.Prim, lights: list[Light], domes: list[Dome]) -> None:
+    """Add one light prim to `lights` or `domes`, or a notice."""
+    name = str(prim.GetTypeName())
+    if name not in _KINDS and name not in _DOMES:
+        label = "MeshLightAPI" if prim.HasAPI(UsdLux.MeshLightAPI) else name or "LightAPI"
+        hint = " (sampling of the dome goes on without it)" if name == "PortalLight" else ""
+        _note(context, prim, f"{label} is ignored: it is not rendered as a light{hint}")
+        return
+    light = UsdLux.LightAPI(prim)
+    emission = _emission(context, light)
+    if emission is None:
+        return
+    _note_ignored(context, prim)
+    world_from_light = context.engine_from_stage @ _column(context.xforms.GetLocalToWorldTransform(prim))
+    if not np.isfinite(world_from_light).all():
+        _note(context, prim, "has a transform with NaN or infinity; the light is skipped; repair its xformOps")
+        return
+    if name in _DOMES:
+        dome = read_dome(
+            light, context.time, radiance=emission, world_from_light=world_from_light, notices=context.notices
+        )
+        if dome is not None:
+            domes.append(dome)
+        return
+    shape = _SHAPES[_KINDS[name]](context, prim, world_from_light)
+    if shape is None:
+        return
+    r, g, b = (value * shape.factor for value in emission)
+    lights.append(
+        Light(
+            path=str(prim.GetPath()),
+            kind=_KINDS[name],
+            radiance=(r, g, b),
+            world_from_light=shape.world_from_light,
+            size=shape.size,
+            diffuse=_number(context, prim, "inputs:diffuse", 1.0),
+            specular=_number(context, prim, "inputs:specular", 1.0),
+        )
+    )
+
+
+def _note(context: Context, prim: Usd.Prim, text: str) -> None:
+    context.notices.append(Notice(str(prim.GetPath()), text))
+
+
+def _column(matrix: Any) -> F64:
+    """A Gf row-vector matrix as a numpy matrix for column vectors."""
+    return np.array(matrix, np.float64).T
+
+
+def _shown(prim: Usd.Prim, time: Usd.TimeCode, purposes: tuple[str, ...]) -> bool:
+    imageable = UsdGeom.Imageable(prim)
+    if not imageable:
+        return True
+    visible = imageable.ComputeVisibility(time) != UsdGeom.Tokens.invisible
+    return visible and str(imageable.ComputePurpose()) in purposes
+
+
+def _value(context: Context, prim: Usd.Prim, name: str, default: Any) -> Any:
+    attribute = prim.GetAttribute(name)
+    value = attribute.Get(context.time) if attribute else None
+    return default if value is None else value
+
+
+def _number(context: Context, prim: Usd.Prim, name: str, default: float) -> float:
+    """A finite number >= 0; anything else becomes `default` with a notice."""
+    value = float(_value(context, prim, name, default))
+    if math.isfinite(value) and value >= 0.0:
+        return value
+    _note(context, prim, f"{name} is {value}; the valid range is at least 0; {default} is used")
+    return default
+
+
+def _emission(context: Context, light: UsdLux.LightAPI) -> tuple[float, float, float] | None:
+    """color * intensity * 2^exposure * colour temperature (UsdLuxLightAPI); None with a notice where it is no number.
+
+    `normalize` is not in it: it needs the light's shape.
+    """
+    prim = light.GetPrim()
+    intensity = float(_value(context, prim, "inputs:intensity", 1.0))
+    exposure = float(_value(context, prim, "inputs:exposure", 0.0))
+    color = np.array(_value(context, prim, "inputs:color", (1.0, 1.0, 1.0)), np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        emission = color * intensity * np.exp2(exposure) * _temperature(context, prim)
+    if not np.isfinite(emission).all() or (emission < 0.0).any() or float(emission.max()) > 1e30:
+        shown = tuple(color.tolist())
+        _note(context, prim, f"intensity {intensity}, exposure {exposure}, color {shown} is no finite positive "
+                             "emission; the light is skipped; author values of at least 0")  # fmt: skip
+        return None
+    return (float(emission[0]), float(emission[1]), float(emission[2]))
+
+
+def _temperature(context: Context, prim: Usd.Prim) -> F64:
+    if not _value(context, prim, "inputs:enableColorTemperature", False):
+        return np.ones(3)
+    kelvin = float(_value(context, prim, "inputs:colorTemperature", 6500.0))
+    low, high = _KELVIN
+    if not low <= kelvin <= high:  # usd-core 26.11 crashes on NaN
+        used = min(max(kelvin, low), high) if math.isfinite(kelvin) else 6500.0
+        _note(context, prim, f"inputs:colorTemperature is {kelvin}; the valid range is {low:g} to {high:g} K; "
+                             f"{used:g} is used")  # fmt: skip
+        kelvin = used
+    return np.array(UsdLux.BlackbodyTemperatureAsRgb(kelvin), np.float64)
+
+
+def _factor(context: Context, prim: Usd.Prim, area: float) -> float:
+    """1 / sizeFactor: one, or with `normalize` one over the surface area; `area` in m^2, sizeFactor in stage units."""
+    if not _value(context, prim, "inputs:normalize", False):
+        return 1.0
+    return context.metres_per_unit**2 / area
+
+
+# --- shapes ---------------------------------------------------------------------------------------------------------
+
+
+def _frame(matrix: F64) -> F64:
+    """Rotation and translation of a 4x4 whose -Z is kept as the emission axis; mirroring is turned into X."""
+    frame = np.eye(4)
+    axes = matrix[:3, :3].copy()
+    if not axes[:, 2].any():  # flattened along its own axis, which a rectangle or disk survives
+        axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
+    turned = rotation(axes)
+    if np.linalg.det(turned) < 0.0:
+        turned[:, 0] = -turned[:, 0]
+    frame[:3, :3] = turned
+    frame[:3, 3] = matrix[:3, 3]
+    return frame
+
+
+def _scales(context: Context, prim: Usd.Prim, matrix: F64, axes: int) -> list[float]:
+    """Lengths of the first `axes` columns [m per unit]; says so where they differ or are sheared."""
+    columns = matrix[:3, :3]
+    lengths = [float(np.linalg.norm(columns[:, axis])) for axis in range(axes)]
+    gram = columns[:, :axes].T @ columns[:, :axes]
+    off = float(np.abs(gram - np.diag(np.diag(gram))).max()) if axes > 1 else 0.0
+    if off > 1e-4 * max(lengths) ** 2:
+        _note(context, prim, "is sheared by its transform; the shear is ignored")
+    return lengths
+
+
+def _even(context: Context, prim: Usd.Prim, lengths: list[float], what: str) -> float:
+    """One scale for a round light; the mean that keeps its area or volume where the axes differ."""
+    mean = math.prod(lengths) ** (1.0 / len(lengths))
+    if max(lengths) - min(lengths) > 1e-4 * max(lengths):
+        _note(context, prim, f"has a non-uniform scale; the {what} is read as round with the mean radius")
+    return mean
+
+
+def _sphere(context: Context, prim: Usd.Prim, matrix: F64) -> Shape | None:
+    """A sphere; with treatAsPoint or radius 0 a point, of the radiant intensity L * pi * r^2 of that sphere."""
+    scale = _even(context, prim, _scales(context, prim, matrix, 3), "sphere")
+    radius = _number(context, prim, "inputs:radius", 0.5) * scale
+    if radius > 0.0 and not _value(context, prim, "treatAsPoint", False):
+        area = 4.0 * math.pi * radius**2
+        return Shape(_frame(matrix), (radius, 0.0), _factor(context, prim, area))
+    if _value(context, prim, "inputs:normalize", False):
+        return Shape(_frame(matrix), (0.0, 0.0), 0.25 * context.metres_per_unit**2)
+    if radius > 0.0:
+        return Shape(_frame(matrix), (0.0, 0.0), math.pi * radius**2)
+    _note(context, prim, "has radius 0 and inputs:normalize off, which gives no light; it is read as if normalize "
+                         "were on; author inputs:normalize = 1")  # fmt: skip
+    return Shape(_frame(matrix), (0.0, 0.0), 0.25 * context.metres_per_unit**2)
+
+
+def _rect(context: Context, prim: Usd.Prim, matrix: F64) -> Shape | None:
+    sx, sy = _scales(context, prim, matrix, 2)
+    width = _number(context, prim, "inputs:width", 1.0) * sx
+    height = _number(context, prim, "inputs:height", 1.0) * sy
+    if width * height <= 0.0:
+        _note_no_area(context, prim, "inputs:width and inputs:height")
+        return None
+    return Shape(_frame(matrix), (width, height), _factor(context, prim, width * height))
+
+
+def _disk(context: Context, prim: Usd.Prim, matrix: F64) -> Shape | None:
+    scale = _even(context, prim, _scales(context, prim, matrix, 2), "disk")
+    radius = _number(context, prim, "inputs:radius", 0.5) * scale
+    if radius <= 0.0:
+        _note_no_area(context, prim, "inputs:radius")
+        return None
+    return Shape(_frame(matrix), (radius, 0.0), _factor(context, prim, math.pi * radius**2))
+
+
+def _note_no_area(context: Context, prim: Usd.Prim, names: str) -> None:
+    _note(context, prim, f"has no area, so it gives no light and is skipped; author {names} above 0")
+
+
+def _distant(context: Context, prim: Usd.Prim, matrix: F64) -> Shape | None:
+    """sizeFactor of UsdLuxLightAPI: pi sin^2(angle / 2), or pi (2 - sin^2) beyond a half angle of 90 degrees."""
+    degrees = min(_number(context, prim, "inputs:angle", 0.53), 360.0)
+    half = math.radians(degrees) / 2.0
+    size_factor = 1.0
+    if half > 0.0:
+        square = math.sin(half) ** 2
+        size_factor = math.pi * (square if half <= math.pi / 2.0 else 2.0 - square)
+    normalize = bool(_value(context, prim, "inputs:normalize", False))
+    return Shape(_frame(matrix), (2.0 * half, 0.0), 1.0 / size_factor if normalize else 1.0)
+
+
+_SHAPES = {
+    LightKind.SPHERE: _sphere,
+    LightKind.RECT: _rect,
+    LightKind.DISK: _disk,
+    LightKind.DISTANT: _distant,
+}
+
+
+# --- what is ignored ------------------------------------------------------------------------------------------------
+
+
+def _note_ignored(context: Context, prim: Usd.Prim) -> None:
+    """One notice per thing that is authored on the light and not rendered."""
+    for what in [*_ignored_shaping(context, prim), *_ignored_links(prim), *_ignored_inputs(context, prim)]:
+        _note(context, prim, f"{what} is ignored; the light shines without it")
+
+
+def _ignored_shaping(context: Context, prim: Usd.Prim) -> list[str]:
+    found = []
+    # Below this the cone cuts something off: area and distant lights shine into one half only.
+    whole = 180.0 if prim.GetTypeName() == "SphereLight" else 90.0
+    if float(_value(context, prim, "inputs:shaping:cone:angle", 180.0)) < whole:
+        found.append("inputs:shaping:cone:angle")
+    if float(_value(context, prim, "inputs:shaping:focus", 0.0)) > 0.0:
+        found.append("inputs:shaping:focus")
+    asset = _value(context, prim, "inputs:shaping:ies:file", None)
+    if asset is not None and asset.path:
+        found.append("inputs:shaping:ies:file")
+    return found
+
+
+def _ignored_links(prim: Usd.Prim) -> list[str]:
+    found = []
+    for name in ("lightLink", "shadowLink"):
+        prefix = f"collection:{name}"
+        include = prim.GetAttribute(f"{prefix}:includeRoot")
+        partial = bool(include) and include.Get() is False
+        listed = [prim.GetRelationship(f"{prefix}:{end}") for end in ("includes", "excludes")]
+        if partial or any(rel and rel.GetTargets() for rel in listed):
+            found.append(f"{prefix} (light linking)")
+    for name in ("light:filters", "portals"):
+        relationship = prim.GetRelationship(name)
+        if relationship and relationship.GetTargets():
+            found.append(name)
+    return found
+
+
+def _ignored_inputs(context: Context, prim: Usd.Prim) -> list[str]:
+    found = []
+    if _value(context, prim, "inputs:shadow:enable", True) is False:
+        found.append("inputs:shadow:enable = 0")
+    if any(float(c) != 0.0 for c in _value(context, prim, "inputs:shadow:color", (0.0, 0.0, 0.0))):
+        found.append("inputs:shadow:color")
+    asset = _value(context, prim, "inputs:texture:file", None)
+    if prim.GetTypeName() == "RectLight" and asset is not None and asset.path:
+        found.append("inputs:texture:file")
+    if prim.GetTypeName() in _DOMES:
+        for name in ("inputs:diffuse", "inputs:specular"):
+            if float(_value(context, prim, name, 1.0)) != 1.0:
+                found.append(name)
+    for attribute in prim.GetAttributes():
+        if attribute.GetName().startswith("inputs:") and attribute.HasAuthoredConnections():
+            found.append(f"connection of {attribute.GetName()}")
+    return found
+
+
+def _note_instanced(prim: Usd.Prim, notices: list[Notice]) -> None:
+    """Lights among a point instancer's prototypes are not multiplied."""
+    inside = Usd.PrimRange(prim, Usd.TraverseInstanceProxies())
+    if any(child.HasAPI(UsdLux.LightAPI) for child in inside if child != prim):
+        notices.append(Notice(str(prim.GetPath()), "lights inside a PointInstancer are ignored"))

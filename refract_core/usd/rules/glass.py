@@ -1,0 +1,264 @@
+"""Rules about glass, checked on a scene's arrays: its shape against its model, its thickness against its size."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...scene import F64, Material, Mesh, Model, Param, Scene, Source, Sphere
+from ...thickness.fit import CONVEX_TOLERANCE
+from .values import ERROR, WARNING, Finding, Repair, Rule
+
+FLAT = 0.2
+"""A body is flat whose smallest side is under this part of its largest."""
+LONGER = 1.5
+"""A thickness is too large over this many times the body's largest side ..."""
+THINNER = 0.1
+"""... and that of a sphere too small under this part of its smallest."""
+_MANY = 50.0
+"""Two units differ much where one is so many times the other."""
+_AGREES = 2.0
+"""A thickness fits a body up to this factor, once its unit is put right."""
+_UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001}
+_FACES = 256
+"""Faces of a mesh whose planes are looked at for convexity."""
+
+OPEN = Rule("refract.sphere-on-open", ERROR, "The sphere model stands on a closed mesh.")
+FLAT_SPHERE = Rule("refract.sphere-on-flat", WARNING, "The sphere model stands on a body that is not flat.")
+TRACED_OPEN = Rule("refract.traced-on-open", WARNING, "The traced model stands on a closed mesh.")
+SIZE = Rule("refract.thickness-against-size", WARNING, "The thickness fits the size of the object.")
+UNITS = Rule("refract.thickness-units", WARNING, "The thickness is in the unit of the stage.")
+INSIDE_OUT = Rule("refract.inverted-normals", ERROR, "Closed glass faces outwards.", safe=True)
+NO_UV = Rule("refract.thickness-map-without-uv", ERROR, "A mesh with a thickness map has the uv that the map reads.")
+
+
+class Thickness(NamedTuple):
+    """How thick a piece of glass is said to be."""
+
+    how: str
+    """typed, mapped (a texture), measured (a primvar), fixed (by the thin model) or unused (by the traced one)"""
+    low: float
+    """[m]"""
+    high: float
+    """[m]"""
+
+
+class Glass(NamedTuple):
+    """One refractive material on one prim."""
+
+    path: str
+    row: Material
+    model: Model
+    points: F64
+    """shape (V, 3) [m]: the corners of its triangles, engine world; a sphere's centre and its ends along the axes"""
+    triangles: NDArray[np.int64]
+    """shape (T, 3), indices into `points`; none on an exact sphere"""
+    closed: bool
+    convex: bool
+    sides: tuple[float, float, float]
+    """[m]: extents along its own main axes, ascending"""
+    thickness: Thickness
+    has_uv: bool
+    """False: a thickness map reads a uv that is not there"""
+    radius: float = 0.0
+    """[m]; > 0: an exact sphere"""
+
+
+def glass_of(scene: Scene) -> list[Glass]:
+    """Every piece of glass of a scene, in its order."""
+    refractive = [material.refractive for material in scene.materials]
+    found = []
+    for mesh in scene.meshes:
+        for number in np.unique(mesh.materials).tolist() if len(mesh.materials) else []:
+            if refractive[number]:
+                found.append(_of_mesh(mesh, number, scene))
+    found += [_of_sphere(ball, scene) for ball in scene.spheres if refractive[ball.material]]
+    return found
+
+
+def _of_mesh(mesh: Mesh, number: int, scene: Scene) -> Glass:
+    row = scene.materials[number]
+    mine = mesh.materials == number
+    points, triangles = mesh.points.astype(np.float64), mesh.triangles[mine].astype(np.int64)
+    if not mine.all():
+        used, places = np.unique(triangles, return_inverse=True)
+        points, triangles = points[used], places.reshape(-1, 3)
+    closed = mesh.closed and bool(mine.all())
+    source = row.inputs[Param.THICKNESS]
+    return Glass(
+        mesh.path, row, row.model, points, triangles, closed, closed and is_convex(points, triangles), sides(points),
+        _thickness(row, mesh.primvars, scene), source.texture < 0 or source.uv_primvar in mesh.primvars,
+    )  # fmt: skip
+
+
+def _of_sphere(ball: Sphere, scene: Scene) -> Glass:
+    row = scene.materials[ball.material]
+    centre = np.array(ball.centre, np.float64)
+    points = np.concatenate((centre[None], centre + np.eye(3) * ball.radius, centre - np.eye(3) * ball.radius))
+    source = row.inputs[Param.THICKNESS]
+    return Glass(
+        ball.path, row, row.model, points, np.zeros((0, 3), np.int64), True, True, (2.0 * ball.radius,) * 3,
+        _thickness(row, ball.primvars, scene), source.texture < 0 or source.uv_primvar in ball.primvars, ball.radius,
+    )  # fmt: skip
+
+
+def _thickness(row: Material, primvars: dict[str, NDArray[np.float32]], scene: Scene) -> Thickness:
+    source = row.inputs[Param.THICKNESS]
+    if row.model is Model.THIN:
+        return Thickness("fixed", source.value[0], source.value[0])
+    how, low, high = _extent(source, primvars, scene)
+    return Thickness("unused" if row.model is Model.TRACED else how, low, high)
+
+
+def _extent(source: Source, primvars: dict[str, NDArray[np.float32]], scene: Scene) -> tuple[str, float, float]:
+    if source.texture >= 0:
+        texture = scene.textures[source.texture]
+        channel = min(int(source.channel), 3)
+        plane = texture.pixels[..., channel]
+        full = 255.0 if plane.dtype.kind == "u" else 1.0
+        ends = [float(end) / full * source.scale[channel] + source.bias[channel] for end in (plane.min(), plane.max())]
+        return "mapped", min(ends), max(ends)
+    if source.primvar in primvars:
+        values = primvars[source.primvar].astype(np.float64)
+        ends = [float(end) * source.scale[0] + source.bias[0] for end in (values.min(), values.max())]
+        return "measured", min(ends), max(ends)
+    return "typed", source.value[0], source.value[0]
+
+
+def sides(points: F64) -> tuple[float, float, float]:
+    """Extents along the main axes of a cloud of points (V, 3), ascending: those of its box, however it is turned."""
+    around = points - points.mean(axis=0)
+    _, axes = np.linalg.eigh(around.T @ around)
+    a, b, c = sorted(np.ptp(around @ axes, axis=0).tolist())
+    straight = sorted(np.ptp(around, axis=0).tolist())
+    return (a, b, c) if a * b * c < straight[0] * straight[1] * straight[2] else (straight[0], straight[1], straight[2])
+
+
+def is_convex(points: F64, triangles: NDArray[np.int64]) -> bool:
+    """No point stands in front of a face; of many faces, an even choice is looked at."""
+    step = max(1, len(triangles) // _FACES)
+    at = points[triangles[::step]]
+    normals = np.cross(at[:, 1] - at[:, 0], at[:, 2] - at[:, 0])
+    normals /= np.maximum(np.sqrt((normals**2).sum(axis=1, keepdims=True)), 1e-300)
+    if signed_volume(points, triangles) < 0.0:
+        normals = -normals
+    limit = CONVEX_TOLERANCE * float(np.linalg.norm(np.ptp(points, axis=0)))
+    for some in np.array_split(np.arange(len(at)), max(1, len(at) * len(points) // 4_000_000)):
+        heights = points @ normals[some].T - (normals[some] * at[some, 0]).sum(axis=1)
+        if heights.max() > limit:
+            return False
+    return True
+
+
+def signed_volume(points: F64, triangles: NDArray[np.int64]) -> float:
+    """[m3], by the divergence theorem: positive where a closed surface faces outwards."""
+    at = points[triangles] - points[triangles[0, 0]]
+    return float((at[:, 0] * np.cross(at[:, 1], at[:, 2])).sum() / 6.0)
+
+
+def winding(point: F64, points: F64, triangles: NDArray[np.int64]) -> float:
+    """How often a closed surface goes round a point: 1 inside, 0 outside, -1 inside one that is inside out.
+
+    Sum of the triangles' solid angles over 4 pi (Van Oosterom and Strackee, IEEE Trans. Biomed. Eng. 30(2), 1983).
+    """
+    a, b, c = (points[triangles[:, corner]] - point for corner in range(3))
+    la, lb, lc = (np.sqrt((side**2).sum(axis=1)) for side in (a, b, c))
+    above = (a * np.cross(b, c)).sum(axis=1)
+    below = la * lb * lc + (a * b).sum(axis=1) * lc + (b * c).sum(axis=1) * la + (c * a).sum(axis=1) * lb
+    return float(np.arctan2(above, below).sum() / (2.0 * np.pi))
+
+
+# --- rules ----------------------------------------------------------------------------------------------------------
+
+
+def glass_findings(scene: Scene, glass: list[Glass], unsure: Collection[str] = ()) -> list[Finding]:
+    """What is wrong with the glass of a scene.
+
+    Args:
+        unsure: materials whose thickness is known to be wrong, so that its size tells nothing
+    """
+    found: list[Finding] = []
+    for piece in glass:
+        found += _shape(piece)
+        if piece.row.name not in unsure:
+            found += _lengths(piece, scene.metres_per_unit)
+        if not piece.has_uv:
+            found.append(_no_uv(piece))
+        inwards = piece.closed and len(piece.triangles) and signed_volume(piece.points, piece.triangles) < 0.0
+        if inwards and not any(_holds(other, piece) for other in glass):
+            found.append(_inside_out(piece))
+    return found
+
+
+def _finding(rule: Rule, path: str, text: str, fix: str, about: str = "", repairs: tuple[Repair, ...] = ()) -> Finding:
+    return Finding(rule.id, rule.severity, path, text, fix, about, repairs)
+
+
+def _shape(piece: Glass) -> Iterator[Finding]:
+    convert = "run refract convert, which chooses a model by the shape"
+    if piece.model is Model.SPHERE and not piece.closed:
+        text = f"the sphere model of {piece.row.name} is on an open mesh, which is no ball; use thin or box"
+        yield _finding(OPEN, piece.path, text, f"set refraction:model to 'thin', or {convert}", "refraction:model")
+    elif piece.model is Model.SPHERE and piece.sides[0] < FLAT * piece.sides[2]:
+        a, b, c = piece.sides
+        text = f"the sphere model of {piece.row.name} is on a flat body of {a:.3g} x {b:.3g} x {c:.3g} m"
+        fix = f"set refraction:model to 'box', or {convert}"
+        yield _finding(FLAT_SPHERE, piece.path, text, fix, "refraction:model")
+    elif piece.model is Model.TRACED and not piece.closed:
+        text = f"the traced model of {piece.row.name} is on an open mesh, which has no far side; it is drawn as 'thin'"
+        yield _finding(TRACED_OPEN, piece.path, text, "close the mesh, or set refraction:model to 'thin'")
+
+
+def _lengths(piece: Glass, unit: float) -> Iterator[Finding]:
+    """The unit trap first: where it explains the size, that is all there is to say."""
+    if piece.model not in (Model.SPHERE, Model.BOX) or not piece.closed or piece.sides[0] <= 0.0:
+        return
+    size = piece.sides[0] if piece.model is Model.BOX else float(np.prod(piece.sides) ** (1.0 / 3.0))
+    high, about = piece.thickness.high, "thickness"
+    for name, metres in _UNITS.items():
+        factor = metres / unit
+        much = factor >= _MANY or factor <= 1.0 / _MANY
+        if much and piece.convex and size / _AGREES <= high * factor <= size * _AGREES:
+            text = (
+                f"the thickness of {piece.row.name} is {high / unit:.3g} units, or {high:.3g} m, on a body of "
+                f"{size:.3g} m; in {name} it would fit, but the unit of this stage is {unit:g} m"
+            )
+            fix = f"multiply inputs:refraction:thickness of {piece.row.name} by {factor:g}"
+            yield _finding(UNITS, piece.path, text, fix, about)
+            return
+    measured = "run refract bake thickness STAGE OUT, which measures it"
+    if high > LONGER * piece.sides[2]:
+        text = f"the thickness of {piece.row.name} is {high:.3g} m, but the body is {piece.sides[2]:.3g} m at most"
+        yield _finding(SIZE, piece.path, text, measured, about)
+    elif piece.model is Model.SPHERE and high < THINNER * piece.sides[0]:
+        text = f"the thickness of {piece.row.name} is {high:.3g} m, but the body is {piece.sides[0]:.3g} m at least"
+        yield _finding(SIZE, piece.path, text, f"{measured}; a hollow body wants the thin model", about)
+
+
+def _no_uv(piece: Glass) -> Finding:
+    source = piece.row.inputs[Param.THICKNESS]
+    name = f"primvars:{source.uv_primvar}" if source.uv_primvar else "any primvar (its texture has no inputs:st)"
+    text = f"the thickness map of {piece.row.name} reads {name}, which is not there, so all of it has one thickness"
+    fix = "author the uv, or run refract bake thickness STAGE OUT, which stores it at the points"
+    return _finding(NO_UV, piece.path, text, fix, source.uv_primvar)
+
+
+def _inside_out(piece: Glass) -> Finding:
+    text = "the mesh is closed but its faces look inwards, so light enters where it should leave"
+    fix = "turn its orientation attribute round, or reverse its faces"
+    return _finding(INSIDE_OUT, piece.path, text, fix, "orientation")
+
+
+def _holds(outer: Glass, inner: Glass) -> bool:
+    """One piece of glass lies inside another: a bubble, whose faces look into the gas."""
+    point = inner.points[0]
+    if outer is inner or not outer.closed:
+        return False
+    if outer.radius > 0.0:
+        return bool(np.linalg.norm(outer.points[0] - point) < outer.radius)
+    if (point < outer.points.min(axis=0)).any() or (point > outer.points.max(axis=0)).any():
+        return False
+    return winding(point, outer.points, outer.triangles) > 0.5

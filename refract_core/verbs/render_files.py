@@ -1,0 +1,274 @@
+"""From a stage on disk to picture files: one frame or many, with the settings that a person and the stage chose."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from ..errors import Cancelled, ImageError, UsageError
+from ..files import replacing
+from ..progress import Report
+from ..scene import Notice, Scene
+from ..settings import RenderSettings
+from .executors import Bench, Crew, file_bytes, patience, sent_stage, spread
+from .override import OverrideError, Overrides, check_overrides, override, override_notes
+
+if TYPE_CHECKING:
+    from ..images.frame import Frame
+
+COMPLEXITIES = ("low", "medium", "high", "veryhigh")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Order:
+    """What to render, and where to."""
+
+    stage: str
+    """Path of the stage."""
+    out: str
+    """Path of the picture; with `frames`, a pattern with a ### group."""
+    frames: str = ""
+    """USD frame specs with commas between; '' is the stage's start."""
+    overrides: Mapping[str, object] = field(default_factory=dict)
+    """Fields of `RenderSettings` that win over what the stage authors."""
+    materials: Overrides = field(default_factory=dict)
+    """Values that win over what single materials author, see `refract_core.override`."""
+    settings_prim: str = ""
+    """RenderSettings prim whose authored values win over the defaults; '' is the one the stage names, if any."""
+    aovs: tuple[str, ...] = ()
+    color_correction: str = "sRGB"
+    complexity: str = "low"
+    skip_existing: bool = False
+
+
+def render_files(order: Order, report: Report, cancel: Callable[[], bool], crew: Crew | None = None) -> None:
+    """Render every picture of an order and write it.
+
+    Args:
+        order: checked completely before the first ray, as far as that is possible.
+        report: told about progress, notices and files.
+        cancel: True stops the work; files that are complete stay.
+        crew: renders the frames; None renders them here, one after the other.
+
+    Raises:
+        RefractError: whatever goes wrong.
+    """
+    from ..images.pictures import check_output, check_writable
+    from ..usd.time_codes import frame_jobs
+
+    _settings({}, order.overrides)
+    if order.complexity not in COMPLEXITIES:
+        raise UsageError(f"--complexity is '{order.complexity}', not known; choose from {', '.join(COMPLEXITIES)}")
+    with _flag():
+        check_overrides(order.materials)
+    check_output(order.out, order.aovs, order.color_correction)
+    check_writable(order.out)
+    jobs = frame_jobs(order.frames, order.out)
+    for job in jobs:
+        if order.skip_existing and os.path.exists(job.path):
+            report.done(job.path, "exists, skipped")
+    jobs = [job for job in jobs if not (order.skip_existing and os.path.exists(job.path))]
+    if jobs:
+        _render_jobs(order, jobs, report, cancel, crew)
+
+
+class _Shot(NamedTuple):
+    """One picture to make. The same shot of the same stage gives the same bytes, wherever it is rendered."""
+
+    time_code: float | None
+    path: str
+    settings: RenderSettings
+    materials: Overrides
+    aovs: tuple[str, ...]
+    color_correction: str
+    first: bool
+    """Looks for stale probes as well, and for overrides that name nothing."""
+
+
+class _Picture(NamedTuple):
+    """A shot that a worker has made."""
+
+    data: bytes
+    """the file"""
+    width: int
+    height: int
+    notices: tuple[Notice, ...]
+    seconds: float
+
+
+def _render_jobs(
+    order: Order, jobs: Sequence[Any], report: Report, cancel: Callable[[], bool], crew: Crew | None
+) -> None:
+    from ..usd.settings import read_settings
+    from ..usd.stage import open_stage
+
+    told: set[Notice] = set()
+
+    def tell(notices: Sequence[Notice]) -> None:
+        for notice in notices:
+            if notice not in told:
+                told.add(notice)
+                report.warning(notice.path, notice.text)
+
+    report.progress(0.0, "reading the stage")
+    stage = open_stage(order.stage)
+    found: list[Notice] = []
+    if order.complexity != "low":
+        found.append(Notice("--complexity", "subdivision is not done yet, so every complexity draws the same"))
+    settings = _settings(read_settings(stage, order.settings_prim, found), order.overrides)
+    tell(found)
+    choices = settings, order.materials, order.aovs, order.color_correction
+    shots = [_Shot(job.time_code, job.path, *choices, job is jobs[0]) for job in jobs]
+    if crew is None:
+        _render_here(stage, shots, tell, report, cancel)
+    else:
+        _render_elsewhere(order, stage, shots, tell, report, cancel, crew)
+
+
+Tell = Callable[[Sequence[Notice]], None]
+
+
+def _render_here(stage: Any, shots: Sequence[_Shot], tell: Tell, report: Report, cancel: Callable[[], bool]) -> None:
+    from ..usd.stage import scene_from_stage
+
+    read = partial(scene_from_stage, stage)
+    for done, shot in enumerate(shots):
+        started = time.perf_counter()
+        frame = _draw(read, shot, tell, _part(report, done, len(shots)), cancel)
+        _stop_if(cancel)
+        frame.save(shot.path, aovs=shot.aovs, color_correction=shot.color_correction)
+        _say_done(report, shot, frame.width, frame.height, time.perf_counter() - started)
+
+
+def _draw(
+    read: Callable[..., Scene],
+    shot: _Shot,
+    tell: Tell,
+    progress: Callable[[float, str], None],
+    cancel: Callable[[], bool],
+) -> Frame:
+    """Read the stage at the shot's time and render it.
+
+    Args:
+        read: `scene_from_stage` of a stage.
+    """
+    from ..rendering.picture import render
+
+    _stop_if(cancel)
+    settings = shot.settings
+
+    def changed(*, strict: bool = False, **how: Any) -> Scene:
+        """What is read, with the order's values in it. At other times than the first a named thing may be hidden."""
+        with _flag():
+            return override(read(**how), shot.materials, strict=strict)
+
+    scene = changed(strict=shot.first, **_how(shot))
+    tell(scene.notices)
+    if shot.first:
+        tell(_stale(changed, scene, settings))
+    _stop_if(cancel)
+    frame = render(scene, settings, progress=progress, cancel=cancel)
+    tell(frame.notices)
+    return replace(frame, metadata={**frame.metadata, **override_notes(shot.materials)})
+
+
+def _how(shot: _Shot) -> dict[str, Any]:
+    """What of a stage to read for a shot."""
+    return {"time_code": shot.time_code, "purposes": shot.settings.purposes, "camera": shot.settings.camera}
+
+
+def _render_elsewhere(
+    order: Order,
+    stage: Any,
+    shots: Sequence[_Shot],
+    tell: Tell,
+    report: Report,
+    cancel: Callable[[], bool],
+    crew: Crew,
+) -> None:
+    """Frames as pieces of work for a crew; what comes back is written here, so that each is written once and whole."""
+    from ..usd.stage import scene_from_stage
+
+    if order.materials:  # before anybody draws a frame: the first one alone would notice
+        with _flag():
+            override(scene_from_stage(stage, **_how(shots[0])), order.materials)
+    root = stage.GetRootLayer()
+    sent = sent_stage(order.stage, root.realPath or root.identifier)
+    report.progress(0.0, "waiting for the first frame")
+    results = spread(crew, _picture, shots, sent, stop=partial(_stop_if, cancel), waiting=patience(report))
+    for done, (shot, picture) in enumerate(results, 1):
+        tell(picture.notices)
+        with replacing(shot.path, ImageError) as temporary:
+            Path(temporary).write_bytes(picture.data)
+        report.progress(done / len(shots), f"frame {done} of {len(shots)} done")
+        _say_done(report, shot, picture.width, picture.height, picture.seconds)
+
+
+def _picture(bench: Bench, shot: _Shot) -> _Picture:
+    """One frame, on a worker."""
+    started = time.perf_counter()
+    notices: dict[Notice, None] = {}
+    frame = _draw(bench.read, shot, lambda some: notices.update(dict.fromkeys(some)), _unheard, bench.cancel)
+    data = file_bytes(lambda path: frame.save(path, aovs=shot.aovs, color_correction=shot.color_correction), shot.path)
+    return _Picture(data, frame.width, frame.height, tuple(notices), time.perf_counter() - started)
+
+
+def _unheard(_fraction: float, _stage: str) -> None:
+    """Progress within a frame, which nobody far away listens to."""
+
+
+def _say_done(report: Report, shot: _Shot, width: int, height: int, seconds: float) -> None:
+    size = os.path.getsize(shot.path)
+    report.done(shot.path, f"{width} x {height}, {_bytes(size)}, {seconds:.1f} s")
+
+
+def _stale(read: Callable[..., Scene], scene: Scene, settings: RenderSettings) -> list[Notice]:
+    """Baked probes that no longer show what is there; each is asked about the time it was baked at."""
+    if not any(probe.bake for probe in scene.probes):
+        return []
+    from .bake_probes import stale_bakes
+
+    def scene_at(time_code: float) -> Scene:
+        if time_code == scene.time_code and settings.purposes == RenderSettings().purposes:
+            return scene
+        return read(time_code=time_code)
+
+    return stale_bakes(scene.probes, scene_at)
+
+
+def _settings(authored: Mapping[str, object], overrides: Mapping[str, object]) -> RenderSettings:
+    """Defaults, then what the stage authors, then what the caller says."""
+    chosen: dict[str, Any] = {**authored, **overrides}
+    if "image_width" in overrides and "image_height" not in overrides:
+        chosen["image_height"] = 0  # a width alone keeps the camera's aspect, whatever the stage's resolution is
+    return RenderSettings(**chosen)
+
+
+def _part(report: Report, done: int, count: int) -> Callable[[float, str], None]:
+    """Progress of one frame as progress of all."""
+    prefix = f"frame {done + 1} of {count}: " if count > 1 else ""
+    return lambda fraction, stage: report.progress((done + fraction) / count, prefix + stage)
+
+
+@contextmanager
+def _flag() -> Iterator[None]:
+    """What is wrong with an override, said with its flag."""
+    try:
+        yield
+    except OverrideError as error:
+        raise UsageError(f"--override {error}") from error
+
+
+def _stop_if(cancel: Callable[[], bool]) -> None:
+    if cancel():
+        raise Cancelled("cancelled; no unfinished file was left")
+
+
+def _bytes(count: int) -> str:
+    return f"{count / 1e6:.1f} MB" if count >= 1_000_000 else f"{max(count // 1000, 1)} kB"

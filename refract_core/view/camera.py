@@ -1,0 +1,107 @@
+"""A camera conformed to an image: pixels to rays and points to pixels.
+
+Pixel coordinates are continuous, x to the right and y down; the sample of pixel (i, j) stands at (i + 0.5, j + 0.5)
+of a window that already holds the sub-pixel jitter. `z_depth` is along the camera axis, positive in front.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import UsageError
+from ..kernels.compile import inlined
+from ..kernels.vec import dot, normalize, row, sub
+from ..scene import Camera
+
+
+class View(NamedTuple):
+    """What kernels need of a camera."""
+
+    axes: NDArray[np.float64]
+    """shape (4, 3): right, up, forward (unit, engine world), eye [m]"""
+    window: NDArray[np.float64]
+    """shape (4,): left, right, bottom, top at z_depth 1 (perspective) or in metres (orthographic)"""
+    size: NDArray[np.int64]
+    """shape (2,): width, height [pixels]"""
+    clipping: NDArray[np.float64]
+    """shape (2,): near, far z_depth [m]"""
+    orthographic: bool
+
+
+def image_size(camera: Camera, width: int, height: int) -> tuple[int, int]:
+    """Fill in the height that follows from the camera's aspect where `height` is 0."""
+    left, right, bottom, top = camera.window
+    if height == 0:
+        height = max(1, round(width * (top - bottom) / (right - left)))
+    return width, height
+
+
+def view_of(camera: Camera, width: int, height: int, jitter: tuple[float, float] = (0.0, 0.0)) -> View:
+    """Conform `camera` to an image of square pixels by expanding its window, and shift it by `jitter` pixels.
+
+    Raises:
+        UsageError: the camera has no field of view.
+    """
+    left, right, bottom, top = camera.window
+    w, h = right - left, top - bottom
+    if not (np.isfinite([left, right, bottom, top]).all() and w > 0 and h > 0):
+        raise UsageError(f"camera {camera.path} has an empty field of view {camera.window}; check its apertures")
+    grow_x = max(1.0, (width / height) / (w / h))
+    grow_y = max(1.0, (w / h) / (width / height))
+    cx, cy = (left + right) / 2, (bottom + top) / 2
+    w, h = w * grow_x, h * grow_y
+    dx, dy = jitter[0] * w / width, -jitter[1] * h / height
+    m = camera.world_from_camera
+    axes = np.stack([m[:3, 0], m[:3, 1], -m[:3, 2], m[:3, 3]]).astype(np.float64)
+    window = np.array([cx - w / 2 + dx, cx + w / 2 + dx, cy - h / 2 + dy, cy + h / 2 + dy])
+    return View(axes, window, np.array([width, height]), np.array(camera.clipping, np.float64), camera.orthographic)
+
+
+@inlined
+def pixel_ray(view, px, py):  # type: ignore[no-untyped-def]
+    """Ray through a pixel coordinate: origin [m], unit direction, cosine to the camera axis."""
+    left, right, bottom, top = view.window[0], view.window[1], view.window[2], view.window[3]
+    x = left + (right - left) * px / view.size[0]
+    y = top + (bottom - top) * py / view.size[1]
+    r, u, f, eye = row(view.axes, 0), row(view.axes, 1), row(view.axes, 2), row(view.axes, 3)
+    if view.orthographic:
+        origin = (eye[0] + r[0] * x + u[0] * y, eye[1] + r[1] * x + u[1] * y, eye[2] + r[2] * x + u[2] * y)
+        return origin, f, 1.0
+    d = normalize((f[0] + r[0] * x + u[0] * y, f[1] + r[1] * x + u[1] * y, f[2] + r[2] * x + u[2] * y))
+    return eye, d, dot(d, f)
+
+
+@inlined
+def project(view, p):  # type: ignore[no-untyped-def]
+    """A world point to (px, py, z_depth). Meaningless px, py where z_depth <= 0 under perspective."""
+    left, right, bottom, top = view.window[0], view.window[1], view.window[2], view.window[3]
+    v = sub(p, row(view.axes, 3))
+    z = dot(v, row(view.axes, 2))
+    w = 1.0 if view.orthographic else z
+    x = dot(v, row(view.axes, 0)) / w
+    y = dot(v, row(view.axes, 1)) / w
+    return (x - left) / (right - left) * view.size[0], (y - top) / (bottom - top) * view.size[1], z
+
+
+@inlined
+def pixel_point(view, px, py, z):  # type: ignore[no-untyped-def]
+    """The world point at a pixel coordinate and z_depth."""
+    grow = 1.0 if view.orthographic else z
+    x = (view.window[0] + (view.window[1] - view.window[0]) * px / view.size[0]) * grow
+    y = (view.window[3] + (view.window[2] - view.window[3]) * py / view.size[1]) * grow
+    r, u, f, eye = row(view.axes, 0), row(view.axes, 1), row(view.axes, 2), row(view.axes, 3)
+    return (
+        eye[0] + f[0] * z + r[0] * x + u[0] * y,
+        eye[1] + f[1] * z + r[1] * x + u[1] * y,
+        eye[2] + f[2] * z + r[2] * x + u[2] * y,
+    )
+
+
+@inlined
+def pixel_width(view, z):  # type: ignore[no-untyped-def]
+    """Width of a pixel at a z_depth [m]."""
+    w = (view.window[1] - view.window[0]) / view.size[0]
+    return w if view.orthographic else w * z

@@ -1,0 +1,189 @@
+"""Colour and depth pyramids of the opaque layer: what the screen tier reads.
+
+Colour: HDRP's chain (fact: MipGenerator and ColorPyramid.compute): each level is a 2x2 average of the one before, then
+a separable 9-tap binomial blur, sizes halved and floored, until both sides of a level are below 8 pixels.
+Depth: the nearest z_depth of each 2x2 cell, and the farthest that is not background, sizes halved and *ceiled*, so that
+no pixel is ever outside its cell.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..kernels.compile import inlined, kernel
+from .camera import View
+
+
+class ScreenBuffers(NamedTuple):
+    """Level 0 and its pyramids, in flat pools."""
+
+    color: NDArray[np.float32]
+    """shape (N, 3): all levels, row by row"""
+    color_level: NDArray[np.int64]
+    """shape (L, 3): first row in the pool, width, height"""
+    depth: NDArray[np.float32]
+    """shape (N,): nearest of each cell; level 0 is the depth itself"""
+    farthest: NDArray[np.float32]
+    """shape (N,): farthest of each cell and the pixels next to it, background left out (0 where there is nothing else);
+    level 0 is not used"""
+    depth_level: NDArray[np.int64]
+    """shape (D, 3)"""
+    normal: NDArray[np.float32]
+    """shape (H, W, 3): geometric, towards the viewer"""
+
+
+class Screen(NamedTuple):
+    """The buffers and the camera that filled them: what the screen tier reads."""
+
+    camera: View
+    color: NDArray[np.float32]
+    color_level: NDArray[np.int64]
+    depth: NDArray[np.float32]
+    farthest: NDArray[np.float32]
+    depth_level: NDArray[np.int64]
+    normal: NDArray[np.float32]
+
+
+def color_levels(width: int, height: int, blurred: bool) -> NDArray[np.int64]:
+    """Table of the colour levels; level 0 alone where nothing is going to be blurred."""
+    levels = [(0, width, height)]
+    while blurred and max(levels[-1][1:]) >= 8:
+        first, w, h = levels[-1]
+        levels.append((first + w * h, max(1, w // 2), max(1, h // 2)))
+    return np.array(levels, np.int64)
+
+
+def depth_levels(width: int, height: int) -> NDArray[np.int64]:
+    levels = [(0, width, height)]
+    while max(levels[-1][1:]) > 1:
+        first, w, h = levels[-1]
+        levels.append((first + w * h, (w + 1) // 2, (h + 1) // 2))
+    return np.array(levels, np.int64)
+
+
+def new_screen_buffers(w: int, h: int, blurred: bool) -> ScreenBuffers:
+    """Empty pools of the right size; the opaque layer is drawn straight into their level 0."""
+    colors, depths = color_levels(w, h, blurred), depth_levels(w, h)
+
+    def total(levels: NDArray[np.int64]) -> int:
+        return int((levels[:, 1] * levels[:, 2]).sum())
+
+    return ScreenBuffers(
+        np.zeros((total(colors), 3), np.float32),
+        colors,
+        np.zeros(total(depths), np.float32),
+        np.zeros(total(depths), np.float32),
+        depths,
+        np.zeros((h, w, 3), np.float32),
+    )
+
+
+@inlined
+def _average_row(source, w, y, target, tw, row):  # type: ignore[no-untyped-def]
+    """2x2 averages of one destination row; a missing odd column or row repeats the edge."""
+    h = source.shape[0] // w
+    ya, yb = min(2 * y, h - 1), min(2 * y + 1, h - 1)
+    for x in range(tw):
+        xa, xb = min(2 * x, w - 1), min(2 * x + 1, w - 1)
+        for c in range(3):
+            total = source[ya * w + xa, c] + source[ya * w + xb, c] + source[yb * w + xa, c] + source[yb * w + xb, c]
+            target[row * tw + x, c] = 0.25 * total
+
+
+@kernel
+def blur_level(color, levels, level):  # type: ignore[no-untyped-def]
+    """Make colour level `level` from the one below it."""
+    taps = np.array([1.0, 8.0, 28.0, 56.0, 70.0, 56.0, 28.0, 8.0, 1.0]) / 256.0
+    first, w, h = levels[level - 1]
+    source = color[first : first + w * h]
+    first, tw, th = levels[level]
+    target = color[first : first + tw * th]
+    half = np.zeros((tw * th, 3), np.float32)
+    for y in range(th):
+        _average_row(source, w, y, half, tw, y)
+    line = np.zeros((tw, 3), np.float32)
+    across = np.zeros((tw * th, 3), np.float32)
+    for y in range(th):
+        for x in range(tw):
+            for c in range(3):
+                s = 0.0
+                for k in range(9):
+                    s += taps[k] * half[y * tw + min(tw - 1, max(0, x + k - 4)), c]
+                line[x, c] = s
+        across[y * tw : (y + 1) * tw] = line
+    for y in range(th):
+        for x in range(tw):
+            for c in range(3):
+                s = 0.0
+                for k in range(9):
+                    s += taps[k] * across[min(th - 1, max(0, y + k - 4)) * tw + x, c]
+                target[y * tw + x, c] = s
+
+
+@kernel
+def fill_depth_levels(depth, farthest, levels):  # type: ignore[no-untyped-def]
+    """Fill every level above 0 of the two depth pyramids from level 0 of `depth`."""
+    for level in range(1, levels.shape[0]):
+        first, w, h = levels[level - 1]
+        target, tw, th = levels[level]
+        for y in range(th):
+            ya, yb = first + 2 * y * w, first + min(2 * y + 1, h - 1) * w
+            for x in range(tw):
+                xa, xb = 2 * x, min(2 * x + 1, w - 1)
+                i = target + y * tw + x
+                depth[i] = min(min(depth[ya + xa], depth[ya + xb]), min(depth[yb + xa], depth[yb + xb]))
+                if level == 1:
+                    farthest[i] = _farthest_around(depth, w, h, 2 * x, 2 * y)
+                    continue
+                a, b = farthest[ya + xa], farthest[ya + xb]
+                farthest[i] = max(max(a, b), max(farthest[yb + xa], farthest[yb + xb]))
+
+
+@inlined
+def _farthest_around(depth, w, h, x, y):  # type: ignore[no-untyped-def]
+    """Farthest of the 2x2 pixels from (x, y) and the ring around them, background left out: a surface inside a pixel
+    may lie deeper than at its centre, but not deeper than at its neighbour's."""
+    found = np.float32(0.0)
+    for j in range(max(0, y - 1), min(h, y + 3)):
+        for i in range(max(0, x - 1), min(w, x + 3)):
+            z = depth[j * w + i]
+            if z < np.inf:
+                found = max(found, z)
+    return found
+
+
+@inlined
+def _bilinear(color, first, w, h, x, y):  # type: ignore[no-untyped-def]
+    """Bilinear value at pixel coordinates (texel centres at +0.5), clamped to the edge."""
+    x = min(max(x - 0.5, 0.0), w - 1.0)
+    y = min(max(y - 0.5, 0.0), h - 1.0)
+    x0, y0 = int(x), int(y)
+    x1, y1 = min(x0 + 1, w - 1), min(y0 + 1, h - 1)
+    fx, fy = x - x0, y - y0
+    wa, wb, wc, wd = (1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy
+    a, b, c, d = first + y0 * w + x0, first + y0 * w + x1, first + y1 * w + x0, first + y1 * w + x1
+    return (
+        wa * color[a, 0] + wb * color[b, 0] + wc * color[c, 0] + wd * color[d, 0],
+        wa * color[a, 1] + wb * color[b, 1] + wc * color[c, 1] + wd * color[d, 1],
+        wa * color[a, 2] + wb * color[b, 2] + wc * color[c, 2] + wd * color[d, 2],
+    )
+
+
+@inlined
+def color_at(screen, px, py, lod):  # type: ignore[no-untyped-def]
+    """Trilinear colour at a pixel coordinate of level 0."""
+    last = screen.color_level.shape[0] - 1
+    lod = min(max(lod, 0.0), float(last))
+    low = int(lod)
+    first, w, h = screen.color_level[low, 0], screen.color_level[low, 1], screen.color_level[low, 2]
+    u, v = px / screen.camera.size[0], py / screen.camera.size[1]
+    r, g, b = _bilinear(screen.color, first, w, h, u * w, v * h)
+    f = lod - low
+    if f > 0.0 and low < last:
+        first, w, h = screen.color_level[low + 1, 0], screen.color_level[low + 1, 1], screen.color_level[low + 1, 2]
+        r1, g1, b1 = _bilinear(screen.color, first, w, h, u * w, v * h)
+        return (r + (r1 - r) * f, g + (g1 - g) * f, b + (b1 - b) * f)
+    return (r, g, b)

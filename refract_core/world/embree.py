@@ -1,0 +1,291 @@
+"""Embree 4 through its own C API: the device, one BVH, and the packet queries that kernels call.
+
+The library is the `libembree4` inside the `embreex` wheel; embreex itself is never imported (its wrapper has no masks,
+no packets and one thread per call). `rtcIntersect8` and `rtcOccluded8` are registered as LLVM symbols, so compiled
+kernels call them directly and can be cached on disk: addresses are looked up by name at load time.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import weakref
+from collections.abc import Iterable
+from functools import cache
+from importlib import metadata
+from typing import Any, NamedTuple
+
+import llvmlite.binding as llvm
+import numpy as np
+from numba import types
+from numpy.typing import NDArray
+
+from ..errors import EmbreeError, SceneError
+from ..kernels.compile import inlined
+
+# Ray masks: what a ray may see. A geometry carries one of the first five, and one of the rest per captured set.
+# numpy scalars, because numba compiles a function anew for every Python constant it is called with.
+SOLID_STATIC = np.int64(1)
+SOLID_MOVING = np.int64(2)
+CUTOUT_STATIC = np.int64(4)
+CUTOUT_MOVING = np.int64(8)
+REFRACTIVE = np.int64(16)
+FIRST_CAPTURED_BIT = 5
+SOLID = SOLID_STATIC | SOLID_MOVING
+CUTOUT = CUTOUT_STATIC | CUTOUT_MOVING
+OPAQUE = SOLID | CUTOUT
+OPAQUE_STATIC = SOLID_STATIC | CUTOUT_STATIC
+EVERYTHING = np.int64(-1)
+
+# Whether the rays of a packet stay together: Embree then culls with their common frustum.
+COHERENT = np.bool_(True)
+SCATTERED = np.bool_(False)
+
+LANES = 8
+"""Rays of a packet, a block of 4x2 pixels. Eight is native from AVX2 on; sixteen only with AVX-512, and elsewhere
+Embree takes such a packet apart ray by ray (docs/decisions/packets-of-eight.md)."""
+BLOCK_WIDTH, BLOCK_HEIGHT = 4, 2
+_INVALID = -1  # RTC_INVALID_GEOMETRY_ID as int32
+_COHERENT_FLAG = 1 << 16  # RTC_RAY_QUERY_FLAG_COHERENT
+_TRIANGLE, _SPHERE_POINT = 0, 50  # RTCGeometryType
+_INDEX, _VERTEX = 0, 1  # RTCBufferType
+_UINT3, _FLOAT3, _FLOAT4 = 0x5003, 0x9003, 0x9004  # RTCFormat
+_ROBUST = 1 << 2  # RTC_SCENE_FLAG_ROBUST
+
+# Rows of RTCRayHit8 (each row is one 32-bit word for eight lanes).
+ORG_X, ORG_Y, ORG_Z, T_NEAR, DIR_X, DIR_Y, DIR_Z, TIME, T_FAR, MASK, RAY_ID, FLAGS = range(12)
+NG_X, NG_Y, NG_Z, HIT_U, HIT_V, PRIM, GEOM, INST, INST_PRIM = range(12, 21)
+_WORDS = 21
+
+_rtc_intersect8 = types.ExternalFunction(
+    "rtcIntersect8", types.void(types.intp, types.intp, types.intp, types.intp)
+)
+_rtc_occluded8 = types.ExternalFunction("rtcOccluded8", types.void(types.intp, types.intp, types.intp, types.intp))
+
+
+@cache
+def library() -> ctypes.CDLL:
+    """Open the bundled Embree once and make its query functions known to LLVM.
+
+    Raises:
+        EmbreeError: the embreex wheel, or the library in it, is not there.
+    """
+    try:
+        files = metadata.files("embreex") or []
+    except metadata.PackageNotFoundError as missing:
+        raise EmbreeError("embreex, which brings Embree, is not installed; pip install embreex") from missing
+    # The wheel repairers of the three platforms name and place the file differently.
+    found = [f for f in files if "embree4" in f.name and (".so" in f.name or f.name.endswith((".dylib", ".dll")))]
+    if not found:
+        raise EmbreeError("embreex is installed but holds no embree4 library; reinstall a binary wheel of embreex")
+    lib = ctypes.CDLL(str(found[0].locate()))
+    handle, size, flag = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_uint
+    signatures: dict[str, tuple[Any, list[Any]]] = {
+        "rtcNewDevice": (handle, [ctypes.c_char_p]),
+        "rtcReleaseDevice": (None, [handle]),
+        "rtcGetDeviceError": (ctypes.c_int, [handle]),
+        "rtcNewScene": (handle, [handle]),
+        "rtcSetSceneFlags": (None, [handle, flag]),
+        "rtcCommitScene": (None, [handle]),
+        "rtcReleaseScene": (None, [handle]),
+        "rtcNewGeometry": (handle, [handle, ctypes.c_int]),
+        "rtcSetSharedGeometryBuffer": (None, [handle, ctypes.c_int, flag, ctypes.c_int, handle, size, size, size]),
+        "rtcSetGeometryMask": (None, [handle, flag]),
+        "rtcCommitGeometry": (None, [handle]),
+        "rtcAttachGeometryByID": (None, [handle, handle, flag]),
+        "rtcReleaseGeometry": (None, [handle]),
+    }
+    for name, (result, arguments) in signatures.items():
+        function = getattr(lib, name)
+        function.restype, function.argtypes = result, arguments
+    for name in ("rtcIntersect8", "rtcOccluded8"):
+        address = ctypes.cast(getattr(lib, name), ctypes.c_void_p).value
+        assert address is not None
+        llvm.add_symbol(name, address)
+    return lib
+
+
+class Part(NamedTuple):
+    """One Embree geometry: a run of triangles, or one exact sphere."""
+
+    mask: int
+    triangles: NDArray[np.uint32] | None
+    """shape (T, 3), indices into the points given to `build`; None for a sphere."""
+    sphere: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """centre, radius [m]"""
+
+
+class Bvh:
+    """A committed scene. Geometry IDs are the positions in `parts`. Handles are freed with the object."""
+
+    def __init__(self, points: NDArray[np.float32], parts: Iterable[Part]) -> None:
+        """Build from shared arrays, which are kept alive as long as the object.
+
+        Args:
+            points: shape (V, 3) float32, metres, finite.
+            parts: what to attach, in order.
+
+        Raises:
+            SceneError: wrong shape, index out of range, NaN or infinite point, radius not above zero.
+            EmbreeError: Embree refused.
+        """
+        lib = library()
+        parts = list(parts)
+        check_parts(points, parts)
+        # Embree may read 16 bytes at the last vertex.
+        self._points = np.zeros((len(points) + 2, 3), np.float32)
+        self._points[: len(points)] = points
+        self._parts = [
+            np.ascontiguousarray(p.triangles, np.uint32)
+            if p.triangles is not None
+            else np.array([p.sphere], np.float32)
+            for p in parts
+        ]
+        device = lib.rtcNewDevice(None)
+        if not device:
+            raise EmbreeError(f"Embree cannot start on this machine (error {lib.rtcGetDeviceError(None)})")
+        scene = lib.rtcNewScene(device)
+        self._free = weakref.finalize(self, _release, lib, scene, device)
+        lib.rtcSetSceneFlags(scene, _ROBUST)
+        for identifier, (part, array) in enumerate(zip(parts, self._parts, strict=True)):
+            self._attach(lib, device, scene, identifier, part, array)
+        lib.rtcCommitScene(scene)
+        if error := lib.rtcGetDeviceError(device):
+            raise EmbreeError(f"Embree failed to build the scene (error {error}; 4 means out of memory)")
+        self.handle = int(scene)
+        """Address of the RTCScene, for kernels."""
+
+    def _attach(
+        self, lib: ctypes.CDLL, device: int, scene: int, identifier: int, part: Part, array: NDArray[Any]
+    ) -> None:
+        if part.triangles is not None:
+            geometry = lib.rtcNewGeometry(device, _TRIANGLE)
+            pool, count = self._points, len(self._points) - 2
+            lib.rtcSetSharedGeometryBuffer(geometry, _VERTEX, 0, _FLOAT3, pool.ctypes.data, 0, 12, count)
+            lib.rtcSetSharedGeometryBuffer(geometry, _INDEX, 0, _UINT3, array.ctypes.data, 0, 12, len(array))
+        else:
+            geometry = lib.rtcNewGeometry(device, _SPHERE_POINT)
+            lib.rtcSetSharedGeometryBuffer(geometry, _VERTEX, 0, _FLOAT4, array.ctypes.data, 0, 16, 1)
+        lib.rtcSetGeometryMask(geometry, int(part.mask) & 0xFFFFFFFF)
+        lib.rtcCommitGeometry(geometry)
+        lib.rtcAttachGeometryByID(scene, geometry, identifier)
+        lib.rtcReleaseGeometry(geometry)
+
+    def close(self) -> None:
+        """Free the handles now; queries after this are undefined."""
+        self._free()
+
+
+def _release(lib: ctypes.CDLL, scene: int, device: int) -> None:
+    lib.rtcReleaseScene(scene)
+    lib.rtcReleaseDevice(device)
+
+
+def check_parts(points: NDArray[np.float32], parts: list[Part]) -> None:
+    """Refuse what Embree would accept in silence. Raises SceneError."""
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype != np.float32:
+        raise SceneError(f"points must be float32 of shape (V, 3), not {points.dtype} {points.shape}")
+    if not np.isfinite(points).all():
+        bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
+        raise SceneError(f"point {bad} is NaN or infinite: {points[bad].tolist()}")
+    for i, part in enumerate(parts):
+        t = part.triangles
+        if t is None:
+            if not np.isfinite(part.sphere).all() or part.sphere[3] <= 0:
+                raise SceneError(f"part {i}: sphere {part.sphere} must be finite with a radius above 0")
+        elif t.ndim != 2 or t.shape[1] != 3 or t.dtype.kind not in "ui":
+            raise SceneError(f"part {i}: triangles must be integers of shape (T, 3), not {t.dtype} {t.shape}")
+        elif t.size and (int(t.max()) >= len(points) or int(t.min()) < 0):
+            raise SceneError(f"part {i}: a triangle index is outside 0 .. {len(points) - 1}")
+
+
+class Packet(NamedTuple):
+    """Eight rays and their hits in Embree's own layout; one per thread."""
+
+    rays: NDArray[np.float32]
+    """shape (21, 8) float32, 64-byte aligned: rows ORG_X .. INST_PRIM"""
+    words: NDArray[np.int32]
+    """the same memory as int32: MASK, PRIM, GEOM, ..."""
+    valid: NDArray[np.int32]
+    """shape (8,) int32: -1 traces the lane, 0 leaves it alone"""
+    arguments: NDArray[np.int32]
+    """shape (8,) int32: RTCIntersectArguments"""
+    tally: NDArray[np.int64]
+    """shape (1,) int64: rays traced so far"""
+    kept: NDArray[np.int32]
+    """shape (3, 8) int32: where callers at three depths keep `valid` while they trace some lanes again"""
+
+
+def new_packet() -> Packet:
+    """A packet on fresh memory, for use by one thread at a time."""
+    memory = np.zeros((_WORDS + 3) * LANES + 16, np.float32)
+    skip = (-memory.ctypes.data % 64) // 4
+    flat = memory[skip : skip + (_WORDS + 3) * LANES]
+    ints = flat.view(np.int32)
+    arguments = ints[(_WORDS + 1) * LANES :]  # 40 bytes, so two rows
+    arguments[1] = -1  # RTC_FEATURE_FLAG_ALL; context, filter and callback stay null
+    return Packet(
+        rays=flat[: _WORDS * LANES].reshape(_WORDS, LANES),
+        words=ints[: _WORDS * LANES].reshape(_WORDS, LANES),
+        valid=ints[_WORDS * LANES : (_WORDS + 1) * LANES],
+        arguments=arguments,
+        tally=np.zeros(1, np.int64),
+        kept=np.zeros((3, LANES), np.int32),
+    )
+
+
+@inlined
+def clear(packet):  # type: ignore[no-untyped-def]
+    """No lane active."""
+    for lane in range(LANES):
+        packet.valid[lane] = 0
+
+
+@inlined
+def keep_valid(packet, depth):  # type: ignore[no-untyped-def]
+    """Remember which lanes are active, in `packet.kept[depth]`."""
+    for lane in range(LANES):
+        packet.kept[depth, lane] = packet.valid[lane]
+
+
+@inlined
+def set_ray(packet, lane, origin, direction, t_near, t_far, mask):  # type: ignore[no-untyped-def]
+    """Put a ray into a lane and activate it. `direction` need not be unit; distances are in its length."""
+    rays, words = packet.rays, packet.words
+    rays[ORG_X, lane] = origin[0]
+    rays[ORG_Y, lane] = origin[1]
+    rays[ORG_Z, lane] = origin[2]
+    rays[T_NEAR, lane] = t_near
+    rays[DIR_X, lane] = direction[0]
+    rays[DIR_Y, lane] = direction[1]
+    rays[DIR_Z, lane] = direction[2]
+    rays[T_FAR, lane] = t_far
+    words[MASK, lane] = mask
+    words[GEOM, lane] = _INVALID
+    packet.valid[lane] = -1
+
+
+@inlined
+def _active(packet):  # type: ignore[no-untyped-def]
+    n = 0
+    for lane in range(LANES):
+        n -= packet.valid[lane]
+    packet.tally[0] += n
+    return n
+
+
+@inlined
+def intersect(packet, scene, coherent):  # type: ignore[no-untyped-def]
+    """Nearest hit of every active lane; GEOM is -1 where there is none. T_FAR becomes the hit distance."""
+    if _active(packet) == 0:
+        return
+    packet.arguments[0] = _COHERENT_FLAG if coherent else 0
+    _rtc_intersect8(packet.valid.ctypes.data, scene, packet.rays.ctypes.data, packet.arguments.ctypes.data)
+
+
+@inlined
+def occluded(packet, scene, coherent):  # type: ignore[no-untyped-def]
+    """Any hit of every active lane: T_FAR becomes -inf where something is in the way."""
+    if _active(packet) == 0:
+        return
+    packet.arguments[0] = _COHERENT_FLAG if coherent else 0
+    _rtc_occluded8(packet.valid.ctypes.data, scene, packet.rays.ctypes.data, packet.arguments.ctypes.data)

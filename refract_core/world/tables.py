@@ -1,0 +1,264 @@
+"""A scene packed for kernels: one BVH, and flat tables of its geometry and materials."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import SceneError
+from ..scene import Material, Mesh, Param, Scene, Source, Sphere
+from . import embree
+from .embree import CUTOUT_MOVING, CUTOUT_STATIC, FIRST_CAPTURED_BIT, REFRACTIVE, SOLID_MOVING, SOLID_STATIC, Bvh, Part
+
+INPUTS = len(Param)
+
+
+class Geometry(NamedTuple):
+    """Everything hit-able. A *part* is one Embree geometry: the opaque or the refractive triangles of a mesh, or a
+    sphere; its number is Embree's geometry ID. G parts, T primitives, S primvar slots."""
+
+    handle: int
+    """RTCScene"""
+    points: NDArray[np.float32]
+    """shape (V, 3) [m]"""
+    triangles: NDArray[np.uint32]
+    """shape (T, 3); a sphere has one unused row"""
+    material: NDArray[np.int32]
+    """shape (T,)"""
+    first: NDArray[np.int64]
+    """shape (G,): row of a part's first primitive"""
+    sphere: NDArray[np.float32]
+    """shape (G, 4): centre, radius [m]; radius 0 for triangles"""
+    thing: NDArray[np.int32]
+    """shape (G,): index of the prim, meshes first, then spheres"""
+    sheet: NDArray[np.uint8]
+    """shape (G,): 1 where the surface is open, so that both of its sides face the air"""
+    normals: NDArray[np.float32]
+    """shape (N, 3, 3): corner normals"""
+    first_normal: NDArray[np.int64]
+    """shape (G,): row of a part's first corner normals; -1 is flat"""
+    primvars: NDArray[np.float32]
+    """flat pool"""
+    primvar_first: NDArray[np.int64]
+    """shape (G, S): offset into the pool; -1 where the part has no such primvar"""
+    primvar_stride: NDArray[np.int64]
+    """shape (G, S): floats from one triangle to the next; 0 where constant"""
+    primvar_size: NDArray[np.int64]
+    """shape (G, S): floats per value"""
+
+
+class MaterialTable(NamedTuple):
+    """One row per material, one column per `Param`."""
+
+    value: NDArray[np.float32]
+    """shape (M, I, 4)"""
+    texture: NDArray[np.int32]
+    channel: NDArray[np.int32]
+    wrap: NDArray[np.int32]
+    """shape (M, I, 2)"""
+    scale: NDArray[np.float32]
+    bias: NDArray[np.float32]
+    uv_slot: NDArray[np.int32]
+    uv_value: NDArray[np.float32]
+    uv_matrix: NDArray[np.float32]
+    primvar_slot: NDArray[np.int32]
+    driven: NDArray[np.int32]
+    """shape (M,): bit i is set where a texture or primvar drives input i"""
+    model: NDArray[np.int32]
+    """shape (M,), as `scene.Model`"""
+    specular_workflow: NDArray[np.uint8]
+    presence: NDArray[np.uint8]
+    threshold: NDArray[np.float32]
+    cutout: NDArray[np.uint8]
+    absorption_distance: NDArray[np.float32]
+    abbe: NDArray[np.float32]
+
+
+def pack_materials(materials: Sequence[Material], slots: dict[str, int]) -> MaterialTable:
+    """Rows of sources as columns of arrays. `slots` gives primvar names their numbers."""
+
+    def column(get: Any, dtype: Any) -> NDArray[Any]:
+        if not materials:
+            return np.zeros((0, INPUTS, *np.shape(get(Source()))), dtype)
+        return np.array([[get(source) for source in material.inputs] for material in materials], dtype)
+
+    def per_material(get: Any, dtype: Any) -> NDArray[Any]:
+        return np.array([get(material) for material in materials], dtype)
+
+    return MaterialTable(
+        value=column(lambda s: s.value, np.float32),
+        texture=column(lambda s: s.texture, np.int32),
+        channel=column(lambda s: int(s.channel), np.int32),
+        wrap=column(lambda s: (int(s.wrap[0]), int(s.wrap[1])), np.int32),
+        scale=column(lambda s: s.scale, np.float32),
+        bias=column(lambda s: s.bias, np.float32),
+        uv_slot=column(lambda s: slots.get(s.uv_primvar, -1), np.int32),
+        uv_value=column(lambda s: s.uv_value, np.float32),
+        uv_matrix=column(lambda s: s.uv_matrix, np.float32),
+        primvar_slot=column(lambda s: slots.get(s.primvar, -1), np.int32),
+        driven=per_material(_driven, np.int32),
+        model=per_material(lambda m: int(m.model), np.int32),
+        specular_workflow=per_material(lambda m: m.specular_workflow, np.uint8),
+        presence=per_material(lambda m: m.opacity_presence, np.uint8),
+        threshold=per_material(lambda m: m.opacity_threshold, np.float32),
+        cutout=per_material(lambda m: m.cutout, np.uint8),
+        absorption_distance=per_material(lambda m: m.absorption_distance, np.float32),
+        abbe=per_material(lambda m: m.abbe, np.float32),
+    )
+
+
+def _driven(material: Material) -> int:
+    return sum(1 << i for i, source in enumerate(material.inputs) if source.texture >= 0 or source.primvar)
+
+
+def primvar_slots(materials: Sequence[Material]) -> dict[str, int]:
+    """A number for every primvar that some material reads."""
+    names = {name for m in materials for s in m.inputs for name in (s.uv_primvar, s.primvar) if name}
+    return {name: i for i, name in enumerate(sorted(names))}
+
+
+class _Pile:
+    """Arrays gathered part by part, to be concatenated once."""
+
+    def __init__(self, slots: dict[str, int]) -> None:
+        self.slots = slots
+        self.parts: list[Part] = []
+        self.points: list[NDArray[np.float32]] = []
+        self.triangles: list[NDArray[np.uint32]] = []
+        self.material: list[NDArray[np.int32]] = []
+        self.normals: list[NDArray[np.float32]] = []
+        self.primvars: list[NDArray[np.float32]] = []
+        self.rows: list[tuple[int, tuple[float, ...], int, bool, int]] = []
+        self.primvar_rows: list[list[tuple[int, int, int]]] = []
+        self.point_count = self.triangle_count = self.normal_count = self.primvar_count = 0
+
+    def add(self, part: Part, material: NDArray[np.int32], thing: int, sheet: bool,
+            normals: NDArray[np.float32] | None, primvars: dict[str, NDArray[np.float32]]) -> None:  # fmt: skip
+        first_normal = -1
+        if normals is not None:
+            first_normal = self.normal_count
+            self.normals.append(normals)
+            self.normal_count += len(normals)
+        triangles = part.triangles if part.triangles is not None else np.zeros((1, 3), np.uint32)
+        self.rows.append((self.triangle_count, part.sphere, thing, sheet, first_normal))
+        self.parts.append(part)
+        self.triangles.append(triangles)
+        self.material.append(material)
+        self.triangle_count += len(triangles)
+        found = []
+        for name in self.slots:
+            values = primvars.get(name)
+            if values is None:
+                found.append((-1, 0, 0))
+                continue
+            size = values.shape[2]
+            found.append((self.primvar_count, 0 if values.shape[1] == 1 else 3 * size, size))
+            self.primvars.append(np.ascontiguousarray(values, np.float32).reshape(-1))
+            self.primvar_count += values.size
+        self.primvar_rows.append(found)
+
+
+def pack_geometry(
+    scene: Scene, captured_sets: Sequence[frozenset[str] | None] = ()
+) -> tuple[Geometry, Bvh, dict[str, int]]:
+    """Split meshes into opaque and refractive parts, build the BVH, and lay the rest out for kernels.
+
+    Args:
+        captured_sets: prim paths that a restricted ray may see; set k gets mask bit `FIRST_CAPTURED_BIT + k`.
+
+    Returns:
+        The tables, the BVH that must stay alive as long as they are used, and the primvar slots.
+
+    Raises:
+        SceneError: a mesh breaks its contract; the message names its path.
+    """
+    slots = primvar_slots(scene.materials)
+    pile = _Pile(slots)
+    for thing, mesh in enumerate(scene.meshes):
+        _check_mesh(mesh, len(scene.materials))
+        _add_mesh(pile, scene, mesh, thing, captured_sets)
+    for i, ball in enumerate(scene.spheres):
+        _add_sphere(pile, scene, ball, len(scene.meshes) + i, captured_sets)
+    points = np.concatenate(pile.points) if pile.points else np.zeros((0, 3), np.float32)
+    bvh = Bvh(points, pile.parts)
+    columns: list[Any] = list(zip(*pile.rows, strict=True)) or [(), (), (), (), ()]
+    first, sphere, thing_of, sheet, first_normal = columns
+    primvar_rows = np.array(pile.primvar_rows, np.int64).reshape(len(pile.rows), len(slots), 3)
+    geometry = Geometry(
+        handle=bvh.handle,
+        points=points,
+        triangles=np.concatenate(pile.triangles) if pile.triangles else np.zeros((0, 3), np.uint32),
+        material=np.concatenate(pile.material) if pile.material else np.zeros(0, np.int32),
+        first=np.array(first, np.int64),
+        sphere=np.array(sphere, np.float32).reshape(-1, 4),
+        thing=np.array(thing_of, np.int32),
+        sheet=np.array(sheet, np.uint8),
+        normals=np.concatenate(pile.normals) if pile.normals else np.zeros((0, 3, 3), np.float32),
+        first_normal=np.array(first_normal, np.int64),
+        primvars=np.concatenate(pile.primvars) if pile.primvars else np.zeros(0, np.float32),
+        primvar_first=np.ascontiguousarray(primvar_rows[:, :, 0]),
+        primvar_stride=np.ascontiguousarray(primvar_rows[:, :, 1]),
+        primvar_size=np.ascontiguousarray(primvar_rows[:, :, 2]),
+    )
+    return geometry, bvh, slots
+
+
+def prim_of(path: str) -> str:
+    """The prim that a path belongs to: instances of a PointInstancer are drawn as `/Instancer/[7]/...`."""
+    return path.partition("/[")[0]
+
+
+def _mask(material: Material, static: bool, path: str, captured_sets: Sequence[frozenset[str] | None]) -> int:
+    if material.refractive:
+        return int(REFRACTIVE)
+    still, moving = (CUTOUT_STATIC, CUTOUT_MOVING) if material.cutout else (SOLID_STATIC, SOLID_MOVING)
+    mask = int(still if static else moving)
+    for k, paths in enumerate(captured_sets):
+        if paths is None or prim_of(path) in paths:
+            mask |= 1 << (FIRST_CAPTURED_BIT + k)
+    return mask
+
+
+def _add_mesh(pile: _Pile, scene: Scene, mesh: Mesh, thing: int, captured_sets: Sequence[Any]) -> None:
+    used, which = np.unique(mesh.materials, return_inverse=True)
+    masks = [_mask(scene.materials[m], mesh.static, mesh.path, captured_sets) for m in used]
+    mask_of_triangle = np.array(masks, np.int64)[which]
+    base = pile.point_count
+    pile.points.append(mesh.points)
+    pile.point_count += len(mesh.points)
+    for mask in np.unique(mask_of_triangle):
+        keep = slice(None) if (mask_of_triangle == mask).all() else np.flatnonzero(mask_of_triangle == mask)
+        primvars = {k: v if v.shape[1] == 1 else v[keep] for k, v in mesh.primvars.items()}
+        pile.add(
+            Part(int(mask), (mesh.triangles[keep] + np.uint32(base)).astype(np.uint32)),
+            mesh.materials[keep].astype(np.int32),
+            thing,
+            not mesh.closed,
+            None if mesh.normals is None else mesh.normals[keep],
+            primvars,
+        )
+
+
+def _add_sphere(pile: _Pile, scene: Scene, ball: Sphere, thing: int, captured_sets: Sequence[Any]) -> None:
+    part = Part(
+        _mask(scene.materials[ball.material], ball.static, ball.path, captured_sets), None, (*ball.centre, ball.radius)
+    )
+    pile.add(part, np.array([ball.material], np.int32), thing, False, None, ball.primvars)
+
+
+def _check_mesh(mesh: Mesh, material_count: int) -> None:
+    t = len(mesh.triangles)
+    if mesh.materials.shape != (t,) or (t and not 0 <= mesh.materials.min() <= mesh.materials.max() < material_count):
+        raise SceneError(f"{mesh.path}: materials must be {t} indices below {material_count}")
+    if mesh.normals is not None and mesh.normals.shape != (t, 3, 3):
+        raise SceneError(f"{mesh.path}: normals must have shape ({t}, 3, 3), not {mesh.normals.shape}")
+    for name, values in mesh.primvars.items():
+        if values.ndim != 3 or values.shape[:2] not in ((t, 3), (1, 1)):
+            raise SceneError(f"{mesh.path}: primvar {name} must have shape ({t}, 3, D) or (1, 1, D)")
+    try:
+        embree.check_parts(mesh.points, [Part(0, mesh.triangles)])
+    except SceneError as error:
+        raise SceneError(f"{mesh.path}: {error}") from None
