@@ -22,12 +22,12 @@ from pathlib import Path
 
 import refract_core as rc
 from refract_core.kernels.compile import kernel
+from refract_core.kernels.lanes import LANES, scratch
 from refract_core.kernels.pointer import Pointer
-from refract_core.rendering.picture import tiles_of
-from refract_core.transport.scratch import scratch
+from refract_core.rendering.work import tiles_of
 from refract_core.view.camera import image_size, view_of
-from refract_core.view.gbuffer import add_view_ray
-from refract_core.world.embree import EVERYTHING, LANES, T_FAR, clear, intersect
+from refract_core.view.gbuffer import ViewScratch, add_view_ray
+from refract_core.world.embree import EVERYTHING, T_FAR, clear, intersect
 from refract_core.world.tables import pack_geometry
 
 DEFAULT_STAGE = Path(__file__).parents[1] / "usd_samples" / "good" / "glass_behind_glass.usda"
@@ -58,7 +58,7 @@ def bare_seconds_per_ray(scene: rc.Scene, width: int, height: int, jobs: int, re
     with ThreadPoolExecutor(jobs) as pool:
         for _ in range(repeat + 1):
             start = time.perf_counter()
-            counts = list(pool.map(lambda tile: bare_tile(geometry.handle, view, scratch(), tile)[0], tiles))
+            counts = list(pool.map(lambda tile: bare_tile(geometry.handle, view, scratch(ViewScratch), tile)[0], tiles))
             best = min(best, (time.perf_counter() - start) / sum(counts))
     bvh.close()
     return best

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from refract_core.errors import SceneError
 from refract_core.kernels.compile import kernel
+from refract_core.kernels.lanes import LANES
 from refract_core.kernels.pointer import Pointer
 from refract_core.world import embree
-from refract_core.world.embree import LANES, Bvh, Packet, Part, new_packet
+from refract_core.world.embree import Bvh, Packet, Part
 
 F32 = NDArray[np.float32]
 
@@ -36,7 +37,7 @@ def anything(packet, handle, coherent):  # type: ignore[no-untyped-def]
 
 def packet_of(origins: Any, directions: Any, masks: Any = -1, far: float = math.inf) -> Packet:
     """A packet whose first lanes hold the given rays."""
-    packet = new_packet()
+    packet = Packet.fresh()
     count = len(origins)
     packet.rays[embree.ORG_X : embree.ORG_Z + 1, :count] = np.asarray(origins, np.float32).T
     packet.rays[embree.DIR_X : embree.DIR_Z + 1, :count] = np.asarray(directions, np.float32).T
@@ -145,7 +146,7 @@ def test_an_empty_scene_is_missed() -> None:
 
 def test_packets_are_aligned_as_embree_asks() -> None:
     """A packet of N rays and its valid mask stand on 4 N bytes (Embree 4 manual, rtcIntersect4/8/16)."""
-    for packet in [new_packet() for _ in range(20)]:
+    for packet in [Packet.fresh() for _ in range(20)]:
         assert packet.rays.ctypes.data % (4 * LANES) == 0
         assert packet.valid.ctypes.data % (4 * LANES) == 0
 

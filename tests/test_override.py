@@ -186,7 +186,8 @@ def stage(tmp_path: Path) -> Path:
 
 
 def pixels(path: Path) -> Any:
-    return importlib.import_module("refract_core.images.pictures").read_texture(str(path), name="p", color_space="raw").pixels
+    pictures = importlib.import_module("refract_core.images.pictures")
+    return pictures.read_texture(str(path), name="p", color_space="raw").pixels
 
 
 def refract(*words: object) -> tuple[int, str]:

@@ -29,7 +29,8 @@ from scenes import (
 from refract_core.kernels.compile import kernel
 from refract_core.probes.lookup import cube_at
 from refract_core.probes.plan import in_order
-from refract_core.rendering.picture import Session, Work, prepare
+from refract_core.rendering.session import Session, prepare
+from refract_core.rendering.work import Work
 from refract_core.scene import Model, Probe, Scene, Sphere, Volume
 from refract_core.settings import RenderSettings
 

@@ -1,1 +1,3 @@
-"""TODO"""
+"""How per-pixel code is compiled, cached and handed its records; vectors, samples and lanes. Knows no physics."""
+
+__all__ = ["compile", "lanes", "pointer", "sampling", "vec"]

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import zlib
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels.compile import inlined, kernel
+from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Scalars, scratch
 from ..kernels.pointer import Pointer
 from ..kernels.sampling import pixel_offset
 from ..kernels.vec import along, length, normalize, row, scale, transform_direction, transform_point
 from ..scene import Cubemap
-from ..transport.scratch import scratch
-from ..world.embree import BLOCK_HEIGHT, BLOCK_WIDTH, COHERENT, LANES, clear, set_ray
-from ..world.shading import load_hits, shade
+from ..world.embree import COHERENT, Packet, clear, set_ray
+from ..world.shading import Block, load_hits, shade
 from ..world.tracing import intersect_world
 from .faces import (
     CUBE,
@@ -37,6 +37,16 @@ from .planar import seen_from
 
 _ROWS = 32  # rows of a face that one task draws; a multiple of 4
 _BEFORE_WINDOW = 1e-4  # rays start this much before the window, so that what lies in its plane is seen [m]
+
+
+class CaptureScratch(NamedTuple):
+    """What one thread needs to draw a block of texels."""
+
+    packet: Packet
+    block: Block
+    second: Block
+    far: Scalars
+    """T_FAR that each lane started with"""
 
 
 @kernel
@@ -149,8 +159,9 @@ def fill_table(table: ProbeTable, entries: list[Entry], world: Pointer, run: Any
         # By name, not by number: a probe's picture is the same alone and among others.
         seed = 1 + zlib.crc32(probe.path.encode()) % 65521
         rays = capture_rows(
-            world, pointer, scratch(), k, face, y, stop, volume, entries[k].mask, near, far, background, jitter, seed
-        )
+            world, pointer, scratch(CaptureScratch), k, face, y, stop, volume, entries[k].mask, near, far, background,
+            jitter, seed,
+        )  # fmt: skip
         return int(rays)
 
     rays = sum(run(draw, tasks))

@@ -1,1 +1,3 @@
-"""TODO"""
+"""A frame: the scene made ready, tiles on threads, progress and cancel."""
+
+__all__ = ["picture", "session", "work"]

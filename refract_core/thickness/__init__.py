@@ -1,1 +1,3 @@
-"""TODO"""
+"""The shape of glass: how thick it is by rays, and which model suits it. Arrays in, arrays out."""
+
+__all__ = ["fit", "measure", "picture"]

@@ -22,11 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels.compile import inlined, kernel
+from ..kernels.lanes import LANES
 from ..kernels.vec import add, along, cross, dot, frame, normalize, row, scale, sub
 from ..world.embree import (
     EVERYTHING,
     GEOM,
-    LANES,
     NG_X,
     NG_Y,
     NG_Z,
@@ -34,10 +34,10 @@ from ..world.embree import (
     SCATTERED,
     T_FAR,
     Bvh,
+    Packet,
     Part,
     clear,
     intersect,
-    new_packet,
     set_ray,
 )
 
@@ -161,7 +161,7 @@ def measure(
 
     def work(piece: tuple[int, int]) -> None:
         go_on()
-        _measure(new_packet(), bvh.handle, near, triangles, *places, rays, _ATTEMPTS, sums, *piece)
+        _measure(Packet.fresh(), bvh.handle, near, triangles, *places, rays, _ATTEMPTS, sums, *piece)
 
     threads = min(jobs or os.cpu_count() or 1, len(pieces))
     if threads > 1:

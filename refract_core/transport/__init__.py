@@ -1,1 +1,3 @@
-"""TODO"""
+"""Light through glass: where a ray leaves it, which tier answers there, and how a layer of it is drawn."""
+
+__all__ = ["layers"]

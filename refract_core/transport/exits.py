@@ -8,11 +8,12 @@ ray, as the models do; Fresnel is applied once, at the entry, the same for every
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ..kernels.compile import inlined
+from ..kernels.lanes import LANES, Flags, Pairs, Scalars, Vectors, Words, put
 from ..kernels.vec import along, dot, flip_towards, mul, normalize, row, scale, sub
 from ..optics.interface import THIN_THICKNESS, box_model, reflect, refract, sphere_model, thin_model, transmittance
 from ..scene import Model, Param
@@ -21,7 +22,6 @@ from ..world.embree import (
     GEOM,
     HIT_U,
     HIT_V,
-    LANES,
     OPAQUE,
     PRIM,
     REFRACTIVE,
@@ -30,7 +30,6 @@ from ..world.embree import (
     clear,
     set_ray,
 )
-from ..world.shading import put
 from ..world.surface import color_input, float_input, hit_at, material_of, normal_input
 from ..world.tracing import intersect_world, off_surface
 
@@ -44,44 +43,36 @@ LEFT, EMBEDDED, LOST = 0, 1, 2
 
 
 class Exits(NamedTuple):
-    """Eight rays on their way out. One row per lane."""
+    """Eight rays on their way out."""
 
-    on: Any
-    model: Any
-    ior: Any
-    thickness: Any
+    on: Flags
+    model: Words
+    ior: Scalars
+    thickness: Scalars
     """authored [m]"""
-    color: Any
+    color: Vectors
     """transmittance colour"""
-    absorption_distance: Any
-    point: Any
-    direction: Any
-    path_length: Any
+    absorption_distance: Scalars
+    """[m]"""
+    point: Vectors
+    """[m]"""
+    direction: Vectors
+    path_length: Scalars
     """[m] inside any medium"""
-    transmittance: Any
-    status: Any
+    transmittance: Vectors
+    status: Words
     """LEFT: point and direction are the exit. EMBEDDED: the ray from point along direction meets an opaque object
     inside. LOST: no exit found within MAX_EVENTS."""
-    inside: Any
+    inside: Words
     """part number of the medium the ray is in, or -1"""
-    segment: Any
-    """shape (8,): T_FAR to start with"""
-    hit: Any
-    """shape (8, 3): u, v and distance of the interface a walk has met"""
-    met: Any
-    """shape (8, 2): its part, -1 for none, and primitive"""
-    unanswered: Any
-    """shape (8,): the share of the light from the exit that no tier knew"""
-
-
-def new_exits() -> Exits:
-    """Room for eight rays."""
-    z = np.zeros
-    return Exits(
-        z(LANES, np.int32), z(LANES, np.int32), z(LANES), z(LANES), z((LANES, 3)), z(LANES), z((LANES, 3)),
-        z((LANES, 3)), z(LANES), z((LANES, 3)), z(LANES, np.int32), z(LANES, np.int32), z(LANES), z((LANES, 3)),
-        z((LANES, 2), np.int64), z(LANES),
-    )  # fmt: skip
+    segment: Scalars
+    """T_FAR to start with"""
+    hit: Vectors
+    """u, v and distance of the interface a walk has met"""
+    met: Pairs
+    """its part, -1 for none, and primitive"""
+    unanswered: Scalars
+    """the share of the light from the exit that no tier knew"""
 
 
 @inlined

@@ -12,16 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels.compile import inlined, kernel
+from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Scalars, Vectors, Words
 from ..kernels.vec import dot, row, scale
 from ..optics.interface import channel_iors, fresnel_dielectric, reflect, transmitted_roughness
 from ..scene import Param
 from ..view.gbuffer import view_point
-from ..world.embree import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, OPAQUE
-from ..world.shading import gather, load_surface
+from ..world.embree import OPAQUE, Packet
+from ..world.shading import Block, gather, load_surface
 from ..world.surface import float_input, material_of
 from ..world.tracing import off_surface
-from .exits import EMBEDDED, LOST, find_exits, load_medium
-from .tiers import BY_MARCH, ask
+from .exits import EMBEDDED, LOST, Exits, find_exits, load_medium
+from .tiers import BY_MARCH, Query, ask
 
 
 class Choices(NamedTuple):
@@ -33,6 +34,22 @@ class Choices(NamedTuple):
     """screen tier by proxy"""
     model: int
     """override for every refractive material, or -1"""
+
+
+class LayerScratch(NamedTuple):
+    """What one thread needs to draw a block of a layer."""
+
+    packet: Packet
+    block: Block
+    second: Block
+    third: Block
+    exits: Exits
+    query: Query
+    parts: Words
+    ior: Scalars
+    z_self: Scalars
+    opacity: Scalars
+    through: Vectors
 
 
 class LayerResult(NamedTuple):

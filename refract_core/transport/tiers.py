@@ -7,11 +7,13 @@ the caller, once. So a room of one colour comes out as that colour whichever tie
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..kernels.compile import inlined
+from ..kernels.lanes import LANES, Column, Flags, Scalars, Vectors, Words
 from ..kernels.sampling import unit_pair
 from ..kernels.vec import add, frame, normalize, row, scale
 from ..optics.interface import screen_lod_hdrp
@@ -19,7 +21,7 @@ from ..probes.lookup import influence, probe_light, proxy_distance
 from ..probes.reach import next_of, piece_of
 from ..probes.volumes import update_headroom
 from ..view.screen import screen_march, screen_proxy
-from ..world.embree import LANES, OPAQUE, SCATTERED, clear, set_ray
+from ..world.embree import OPAQUE, SCATTERED, clear, set_ray
 from ..world.environment import prefiltered
 from ..world.shading import load_hits, shade
 from ..world.tracing import intersect_world
@@ -35,33 +37,30 @@ _ROUGH_RAY = 3  # purpose of the sampling sequence
 _SPENT = 1.0 - 1e-6
 
 
+Shares = Annotated[NDArray[np.float64], Column(np.float64, (5,))]
+"""shape (8, 5) float64: what each tier answered, and what none did"""
+
+
 class Query(NamedTuple):
     """Eight rays that want a colour, and what they got."""
 
-    on: Any
-    origin: Any
-    direction: Any
-    normal: Any
+    on: Flags
+    origin: Vectors
+    """[m]"""
+    direction: Vectors
+    normal: Vectors
     """of the entry, on the viewer's side (probes' influence)"""
-    blur: Any
-    roughness: Any
+    blur: Scalars
+    """tangent of the half angle of the ray's cone"""
+    roughness: Scalars
     """perceptual, for HDRP's own mappings"""
-    thing: Any
-    embedded: Any
+    thing: Words
+    embedded: Flags
     """1: the ray starts inside a medium and is known to meet an opaque object there"""
-    color: Any
-    weight: Any
-    """shape (8, 5): screen, ray, probe, sky, none; sums to 1"""
-    confidence: Any
-
-
-def new_query() -> Query:
-    """Room for eight rays."""
-    z = np.zeros
-    return Query(
-        z(LANES, np.int32), z((LANES, 3)), z((LANES, 3)), z((LANES, 3)), z(LANES), z(LANES), z(LANES, np.int32),
-        z(LANES, np.int32), z((LANES, 3)), z((LANES, 5)), z(LANES),
-    )  # fmt: skip
+    color: Vectors
+    weight: Shares
+    """screen, ray, probe, sky, none; sums to 1"""
+    confidence: Scalars
 
 
 @inlined

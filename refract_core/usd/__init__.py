@@ -1,1 +1,17 @@
-"""The only rooms that know USD: stages in, plain arrays out."""
+"""The only wing that knows USD: stages in, plain arrays out, and layers written over them."""
+
+__all__ = [
+    "camera",
+    "convert",
+    "geometry",
+    "layers",
+    "lights",
+    "materials",
+    "probes",
+    "rules",
+    "settings",
+    "stage",
+    "thickness",
+    "thickness_find",
+    "time_codes",
+]

@@ -1,1 +1,16 @@
-"""TODO"""
+"""What a person can ask for, from Python, the command line or HTTP: render files, bake, convert, inspect,
+validate.
+"""
+
+__all__ = [
+    "bake_probes",
+    "bake_thickness",
+    "compare",
+    "convert",
+    "executors",
+    "inspect",
+    "node",
+    "override",
+    "render_files",
+    "validate",
+]

@@ -36,7 +36,7 @@ def bake_one(bench: Bench, errand: Errand) -> tuple[bytes, float]:
         The texture's file, and the seconds it took.
     """
     from ..images.pictures import write_cubemap
-    from ..rendering.picture import capture_probes
+    from ..rendering.session import capture_probes
 
     started = time.perf_counter()
     scene = bench.read(time_code=errand.time_code)

@@ -344,7 +344,7 @@ def _baked_elsewhere(
 
 
 def _engine() -> Capture:
-    from ..rendering.picture import capture_probes
+    from ..rendering.session import capture_probes
 
     return capture_probes
 

@@ -1,1 +1,5 @@
-"""TODO"""
+"""What the camera has: its rays, the opaque picture with its pyramids, what the screen can answer, a frame's
+planes.
+"""
+
+__all__ = ["camera", "gbuffer", "planes", "pyramid", "screen"]

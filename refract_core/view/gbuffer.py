@@ -9,32 +9,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels.compile import inlined, kernel
+from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Scalars
 from ..kernels.vec import dot
 from ..scene import Model
 from ..world.embree import (
-    BLOCK_HEIGHT,
-    BLOCK_WIDTH,
     COHERENT,
     EVERYTHING,
     GEOM,
     HIT_U,
     HIT_V,
-    LANES,
     OPAQUE,
     PRIM,
     REFRACTIVE,
     T_FAR,
+    Packet,
     clear,
     keep_valid,
     set_ray,
 )
 from ..world.environment import radiance
-from ..world.shading import load_hits, shade
+from ..world.shading import Block, load_hits, shade
 from ..world.surface import hit_at, material_of
 from ..world.tracing import intersect_world
 from .camera import pixel_ray
 
 _MAX_SKIPS = 64
+
+
+class ViewScratch(NamedTuple):
+    """What one thread needs to look at a block of pixels."""
+
+    packet: Packet
+    block: Block
+    second: Block
+    far: Scalars
+    """T_FAR that each lane started with"""
 
 
 class OpaqueLayer(NamedTuple):

@@ -1,1 +1,5 @@
-"""TODO"""
+"""The packed scene that rays meet: Embree, tables of geometry and materials, textures, lights, the sky, and the light
+that leaves an opaque hit.
+"""
+
+__all__ = ["embree", "environment", "lights", "shading", "surface", "tables", "textures", "tracing"]

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from ..errors import EmbreeError, SceneError
 from ..kernels.compile import inlined
+from ..kernels.lanes import LANES
 
 # Ray masks: what a ray may see. A geometry carries one of the first five, and one of the rest per captured set.
 # numpy scalars, because numba compiles a function anew for every Python constant it is called with.
@@ -40,10 +41,6 @@ EVERYTHING = np.int64(-1)
 COHERENT = np.bool_(True)
 SCATTERED = np.bool_(False)
 
-LANES = 8
-"""Rays of a packet, a block of 4x2 pixels. Eight is native from AVX2 on; sixteen only with AVX-512, and elsewhere
-Embree takes such a packet apart ray by ray (docs/decisions/packets-of-eight.md)."""
-BLOCK_WIDTH, BLOCK_HEIGHT = 4, 2
 _INVALID = -1  # RTC_INVALID_GEOMETRY_ID as int32
 _COHERENT_FLAG = 1 << 16  # RTC_RAY_QUERY_FLAG_COHERENT
 _TRIANGLE, _SPHERE_POINT = 0, 50  # RTCGeometryType
@@ -214,23 +211,23 @@ class Packet(NamedTuple):
     kept: NDArray[np.int32]
     """shape (3, 8) int32: where callers at three depths keep `valid` while they trace some lanes again"""
 
-
-def new_packet() -> Packet:
-    """A packet on fresh memory, for use by one thread at a time."""
-    memory = np.zeros((_WORDS + 3) * LANES + 16, np.float32)
-    skip = (-memory.ctypes.data % 64) // 4
-    flat = memory[skip : skip + (_WORDS + 3) * LANES]
-    ints = flat.view(np.int32)
-    arguments = ints[(_WORDS + 1) * LANES :]  # 40 bytes, so two rows
-    arguments[1] = -1  # RTC_FEATURE_FLAG_ALL; context, filter and callback stay null
-    return Packet(
-        rays=flat[: _WORDS * LANES].reshape(_WORDS, LANES),
-        words=ints[: _WORDS * LANES].reshape(_WORDS, LANES),
-        valid=ints[_WORDS * LANES : (_WORDS + 1) * LANES],
-        arguments=arguments,
-        tally=np.zeros(1, np.int64),
-        kept=np.zeros((3, LANES), np.int32),
-    )
+    @staticmethod
+    def fresh() -> Packet:
+        """A packet on fresh memory, for use by one thread at a time."""
+        memory = np.zeros((_WORDS + 3) * LANES + 16, np.float32)
+        skip = (-memory.ctypes.data % 64) // 4
+        flat = memory[skip : skip + (_WORDS + 3) * LANES]
+        ints = flat.view(np.int32)
+        arguments = ints[(_WORDS + 1) * LANES :]  # 40 bytes, so two rows
+        arguments[1] = -1  # RTC_FEATURE_FLAG_ALL; context, filter and callback stay null
+        return Packet(
+            rays=flat[: _WORDS * LANES].reshape(_WORDS, LANES),
+            words=ints[: _WORDS * LANES].reshape(_WORDS, LANES),
+            valid=ints[_WORDS * LANES : (_WORDS + 1) * LANES],
+            arguments=arguments,
+            tally=np.zeros(1, np.int64),
+            kept=np.zeros((3, LANES), np.int32),
+        )
 
 
 @inlined

@@ -8,16 +8,18 @@ Every room that needs the colour of an opaque hit calls it: the picture, probes,
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..kernels.compile import inlined
+from ..kernels.lanes import LANES, Flags, Pairs, Rows, Scalars, Vectors, put
 from ..kernels.sampling import unit_pair
 from ..kernels.vec import add, dot, flip_towards, frame, lerp, mul, normalize, row, scale, sub
 from ..optics.lobes import MIRROR_ALPHA, sample_half_vector, specular_albedo
 from ..scene import Param
-from .embree import GEOM, HIT_U, HIT_V, LANES, PRIM, SCATTERED, T_FAR, clear, set_ray
+from .embree import GEOM, HIT_U, HIT_V, PRIM, SCATTERED, T_FAR, clear, set_ray
 from .environment import irradiance, prefiltered, sample_direction
 from .lights import CAMERA_LIGHT, highlight, irradiance_factor, shadow_ray
 from .surface import color_input, float_input, hit_at, material_of, normal_input
@@ -33,52 +35,38 @@ _SKY, _MIRROR = 1, 2
 
 
 class Block(NamedTuple):
-    """Eight opaque hits and the light they send back. One row per lane; `on` says which lanes hold a hit."""
+    """Eight opaque hits and the light they send back."""
 
-    on: Any
-    pixel: Any
-    """shape (8, 2) int64: keys of the sampling sequence"""
-    point: Any
-    ng: Any
+    on: Flags
+    """1 where the lane holds a hit"""
+    pixel: Pairs
+    """keys of the sampling sequence"""
+    point: Vectors
+    """[m]"""
+    ng: Vectors
     """geometric normal, on the viewer's side"""
-    ns: Any
-    wo: Any
-    albedo: Any
+    ns: Vectors
+    """shading normal, on the side of ng"""
+    wo: Vectors
+    """towards the viewer"""
+    albedo: Vectors
     """diffuse reflectance"""
-    f0: Any
-    emissive: Any
-    roughness: Any
-    coat: Any
-    coat_roughness: Any
-    occlusion: Any
-    diffuse: Any
+    f0: Vectors
+    emissive: Vectors
+    roughness: Scalars
+    coat: Scalars
+    coat_roughness: Scalars
+    occlusion: Scalars
+    diffuse: Vectors
     """irradiance that arrived"""
-    specular: Any
+    specular: Vectors
     """radiance of the lights' highlights"""
-    color: Any
+    color: Vectors
     """the result: radiance towards wo"""
-    distance: Any
+    distance: Scalars
     """hit distance [m]; inf where nothing was hit"""
-    scratch: Any
+    scratch: Annotated[NDArray[np.float64], Rows(4)]
     """shape (4, 8)"""
-
-
-def new_block() -> Block:
-    """An empty block."""
-    z = np.zeros
-    return Block(
-        z(LANES, np.int32), z((LANES, 2), np.int64), z((LANES, 3)), z((LANES, 3)), z((LANES, 3)), z((LANES, 3)),
-        z((LANES, 3)), z((LANES, 3)), z((LANES, 3)), z(LANES), z(LANES), z(LANES), z(LANES),
-        z((LANES, 3)), z((LANES, 3)), z((LANES, 3)), z(LANES), z((4, LANES)),
-    )  # fmt: skip
-
-
-@inlined
-def put(a, lane, v):  # type: ignore[no-untyped-def]
-    """Write a tuple into a row of an (N, 3) array."""
-    a[lane, 0] = v[0]
-    a[lane, 1] = v[1]
-    a[lane, 2] = v[2]
 
 
 @inlined

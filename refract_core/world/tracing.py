@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from ..kernels.compile import inlined
+from ..kernels.lanes import LANES
 from ..kernels.sampling import hash32
 from ..kernels.vec import along, dot
 from ..scene import Param
@@ -14,7 +15,6 @@ from .embree import (
     GEOM,
     HIT_U,
     HIT_V,
-    LANES,
     PRIM,
     SCATTERED,
     SOLID,

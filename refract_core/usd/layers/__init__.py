@@ -1,1 +1,3 @@
-"""TODO"""
+"""Layers: asset paths, packages, thin layers over a stage, and their way to disk."""
+
+__all__ = ["edit", "package", "sending", "write"]

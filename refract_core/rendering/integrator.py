@@ -1,0 +1,31 @@
+"""The seam between a frame and how light is found for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple, Protocol
+
+from ..view.camera import View
+
+
+class Pass(NamedTuple):
+    """One pass over the picture. Its items (tiles, as a rule) may be drawn in any order and side by side."""
+
+    draw: Callable[[Any], int]
+    """draws one item, and returns the rays it traced"""
+    items: Sequence[Any]
+
+
+class Integrator(Protocol):
+    """Finds the light of every pixel, and adds it to the planes it was made with.
+
+    What it is made with is its own affair (`layered.Layered` shows it); a frame asks it for one sample after the other.
+    """
+
+    def passes(self, view: View, sample: int) -> Iterator[Pass]:
+        """The passes that draw one sample of every pixel as `view` sees it.
+
+        Each is finished on all its items before the next is asked for, so a pass may read what the ones before it left
+        anywhere in the picture, and which passes there are may depend on that.
+        """
+        ...

@@ -1,0 +1,127 @@
+"""A scene made ready: tables, the BVH they point into, and the pictures of the probes that serve a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import UsageError
+from ..kernels.pointer import Pointer
+from ..probes.capture import cubemap_of, fill_table
+from ..probes.lookup import empty_table
+from ..probes.plan import Plan, plan_capture, plan_picture
+from ..scene import Camera, Cubemap, Notice, Param, Probe, Scene
+from ..settings import RenderSettings
+from ..world import environment, textures
+from ..world.embree import Bvh
+from ..world.lights import pack_lights
+from ..world.tables import pack_geometry, pack_materials
+from ..world.tracing import world_of
+from .work import Cancel, Progress, Work, working
+
+_PROBE_SAMPLES = 4
+"""Most rays per probe texel; more samples of the picture do not make probes finer."""
+
+
+class Session(NamedTuple):
+    """A scene made ready: tables, and the BVH they point into."""
+
+    world: Pointer
+    bvh: Bvh
+    probes: Pointer
+    thing_probe: NDArray[np.int32]
+    rays: int
+    notices: tuple[Notice, ...]
+
+
+def choose_camera(scene: Scene, name: str) -> Camera:
+    """The camera by path or name; the scene's own choice where `name` is ''. Raises UsageError."""
+    if not scene.cameras:
+        raise UsageError("the scene has no camera; the reader always gives one, so add one to Scene.cameras")
+    if not name:
+        return scene.cameras[0]
+    for camera in scene.cameras:
+        if name in (camera.path, camera.path.rpartition("/")[2]):
+            return camera
+    known = ", ".join(camera.path for camera in scene.cameras)
+    raise UsageError(f"--camera {name}: the stage has no such camera; it has {known}")
+
+
+def prepare(scene: Scene, camera: Camera, settings: RenderSettings, height: int, work: Work) -> Session:
+    """Pack tables, build the BVH, capture probes."""
+    wanted = "probe" in settings.tiers or settings.screen == "proxy"
+    chosen = plan_picture(scene, camera, height, wanted)
+    if "probe" not in settings.tiers:  # their proxies may still serve the screen tier
+        chosen = chosen._replace(entries=[entry._replace(drawn=False) for entry in chosen.entries])
+    samples = min(settings.samples, _PROBE_SAMPLES)
+    return _prepare(scene, camera, chosen, is_rough(scene), samples, work, (0.1, 0.2))
+
+
+def _prepare(
+    scene: Scene, camera: Camera, chosen: Plan, rough: bool, samples: int, work: Work, span: tuple[float, float]
+) -> Session:
+    geometry, bvh, slots = pack_geometry(scene, chosen.captured_sets)
+    world = Pointer(
+        world_of(
+            geometry,
+            pack_materials(scene.materials, slots),
+            textures.pack(scene.textures),
+            pack_lights(scene, camera.world_from_camera[:3, 3]),
+            environment.pack(scene.environment),
+        )
+    )
+    entries = chosen.entries
+    table = empty_table([e.probe for e in entries], [e.owned for e in entries], camera, rough)
+
+    def run(function: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
+        return work.run(
+            function, items, lambda share: work.progress(span[0] + (span[1] - span[0]) * share, "probes")
+        )
+
+    work.progress(span[0], "probes")
+    rays = fill_table(table, entries, world, run, samples)
+    return Session(world, bvh, Pointer(table), chosen.thing_probe, rays, chosen.notices)
+
+
+def capture_probes(
+    scene: Scene,
+    probes: Sequence[Probe],
+    *,
+    samples: int = 16,
+    jobs: int = 0,
+    progress: Progress | None = None,
+    cancel: Cancel | None = None,
+    executor: Executor | None = None,
+) -> list[Cubemap]:
+    """Take the pictures of cube probes, with all their levels, as `refract bake probes` does.
+
+    Args:
+        probes: of the scene, or made by hand; what they have for a `cubemap` is ignored. None may be planar.
+        samples: rays per texel, 1 .. 4096.
+        jobs: threads; 0 means all cores.
+
+    Raises:
+        UsageError: a probe is planar: its picture depends on the camera.
+        Cancelled: `cancel` said so.
+    """
+    for probe in probes:
+        if probe.planar:
+            raise UsageError(f"{probe.path}: a planar probe's picture depends on the camera; leave it to the render")
+    with working(executor, jobs, progress, cancel) as work:
+        chosen = plan_capture(scene, [replace(probe, cubemap=None) for probe in probes])
+        session = _prepare(scene, choose_camera(scene, ""), chosen, True, samples, work, (0.0, 1.0))
+    return [cubemap_of(session.probes.record, k) for k in range(len(probes))]
+
+
+def is_rough(scene: Scene) -> bool:
+    """Some refractive material may be rough, so the colour pyramid will be read above level 0."""
+    for material in scene.materials:
+        source = material.inputs[Param.ROUGHNESS]
+        if material.refractive and (source.value[0] > 0.0 or source.texture >= 0 or source.primvar):
+            return True
+    return False
