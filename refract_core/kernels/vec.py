@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from .compile import inlined
 
 Vec = tuple[float, float, float]
@@ -77,7 +79,7 @@ def flip_towards(n: Vec, w: Vec) -> Vec:
 @inlined
 def row(a, i):  # type: ignore[no-untyped-def]
     """Row `i` of an (N, 3) array as a tuple of float64."""
-    return (float(a[i, 0]), float(a[i, 1]), float(a[i, 2]))
+    return (np.float64(a[i, 0]), np.float64(a[i, 1]), np.float64(a[i, 2]))
 
 
 @inlined

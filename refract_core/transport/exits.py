@@ -84,7 +84,7 @@ def load_medium(exits, lane, hit, world, override):  # type: ignore[no-untyped-d
     if model == Model.TRACED.value and g.sheet[hit.part] != 0:
         model = Model.THIN.value  # an open mesh has no far side to find; `open_meshes` says so to the user
     thickness = max(MIN_THICKNESS, float_input(g, mt, tx, hit, m, Param.THICKNESS.value))
-    distance = float(mt.absorption_distance[m])
+    distance = np.float64(mt.absorption_distance[m])
     if model == Model.THIN.value:
         thickness = distance = THIN_THICKNESS
     exits.on[lane] = 1
@@ -150,11 +150,11 @@ def _stop_at_opaque(exits, block, packet, world):  # type: ignore[no-untyped-def
     for lane in range(LANES):
         if packet.valid[lane] == 0 or packet.words[GEOM, lane] < 0:
             continue
-        t = float(packet.rays[T_FAR, lane])
+        t = np.float64(packet.rays[T_FAR, lane])
         rays = packet.rays
         exits.status[lane] = EMBEDDED
-        put(exits.point, lane, (float(rays[0, lane]), float(rays[1, lane]), float(rays[2, lane])))
-        put(exits.direction, lane, (float(rays[4, lane]), float(rays[5, lane]), float(rays[6, lane])))
+        put(exits.point, lane, (np.float64(rays[0, lane]), np.float64(rays[1, lane]), np.float64(rays[2, lane])))
+        put(exits.direction, lane, (np.float64(rays[4, lane]), np.float64(rays[5, lane]), np.float64(rays[6, lane])))
         exits.path_length[lane] = t
         put(exits.transmittance, lane, transmittance(row(exits.color, lane), exits.absorption_distance[lane], t))
 

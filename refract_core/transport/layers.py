@@ -191,7 +191,7 @@ def _set_iors(exits, world, layer, x0, y0, ior, channel):  # type: ignore[no-unt
             continue
         x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
         m = material_of(world.geometry, layer.part[y, x], layer.primitive[y, x])
-        red, green, blue = channel_iors(exits.ior[lane], float(world.materials.abbe[m]))
+        red, green, blue = channel_iors(exits.ior[lane], np.float64(world.materials.abbe[m]))
         ior[lane] = red if channel == 0 else (green if channel == 1 else blue)
 
 

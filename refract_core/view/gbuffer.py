@@ -90,10 +90,10 @@ def _enters(world, packet, lane):  # type: ignore[no-untyped-def]
     if world.geometry.sheet[part] != 0 or world.materials.model[m] == Model.THIN.value:
         return True
     rays = packet.rays
-    origin = (float(rays[0, lane]), float(rays[1, lane]), float(rays[2, lane]))
-    direction = (float(rays[4, lane]), float(rays[5, lane]), float(rays[6, lane]))
-    u, v = float(rays[HIT_U, lane]), float(rays[HIT_V, lane])
-    hit = hit_at(world.geometry, part, primitive, u, v, origin, direction, float(rays[T_FAR, lane]), 0.0)
+    origin = (np.float64(rays[0, lane]), np.float64(rays[1, lane]), np.float64(rays[2, lane]))
+    direction = (np.float64(rays[4, lane]), np.float64(rays[5, lane]), np.float64(rays[6, lane]))
+    u, v = np.float64(rays[HIT_U, lane]), np.float64(rays[HIT_V, lane])
+    hit = hit_at(world.geometry, part, primitive, u, v, origin, direction, np.float64(rays[T_FAR, lane]), 0.0)
     return dot(hit.ng, direction) < 0.0
 
 
@@ -259,10 +259,10 @@ def _peel_block(world, packet, far, layer, x0, y0):  # type: ignore[no-untyped-d
 def view_point(view, layer, world, x, y):  # type: ignore[no-untyped-def]
     """(hit, direction, z_depth) of a refractive layer at a pixel."""
     origin, direction, cosine = pixel_ray(view, x + 0.5, y + 0.5)
-    t = float(layer.distance[y, x])
+    t = np.float64(layer.distance[y, x])
     spread = 0.0 if view.orthographic else (view.window[1] - view.window[0]) / view.size[0]
     hit = hit_at(
-        world.geometry, layer.part[y, x], layer.primitive[y, x], float(layer.u[y, x]), float(layer.v[y, x]),
+        world.geometry, layer.part[y, x], layer.primitive[y, x], np.float64(layer.u[y, x]), np.float64(layer.v[y, x]),
         origin, direction, t, spread,
     )  # fmt: skip
     return hit, direction, t * cosine

@@ -78,10 +78,10 @@ def load_hits(block, packet, world, spread):  # type: ignore[no-untyped-def]
         block.distance[lane] = math.inf
         if packet.valid[lane] == 0 or words[GEOM, lane] < 0:
             continue
-        direction = (float(rays[4, lane]), float(rays[5, lane]), float(rays[6, lane]))
-        origin = (float(rays[0, lane]), float(rays[1, lane]), float(rays[2, lane]))
-        t = float(rays[T_FAR, lane])
-        u, v = float(rays[HIT_U, lane]), float(rays[HIT_V, lane])
+        direction = (np.float64(rays[4, lane]), np.float64(rays[5, lane]), np.float64(rays[6, lane]))
+        origin = (np.float64(rays[0, lane]), np.float64(rays[1, lane]), np.float64(rays[2, lane]))
+        t = np.float64(rays[T_FAR, lane])
+        u, v = np.float64(rays[HIT_U, lane]), np.float64(rays[HIT_V, lane])
         hit = hit_at(world.geometry, words[GEOM, lane], words[PRIM, lane], u, v, origin, direction, t, spread)
         block.on[lane] = 1
         block.distance[lane] = t

@@ -44,7 +44,7 @@ def hit_at(geometry, part, primitive, u, v, origin, direction, distance, spread)
     if geometry.sphere[part, 3] > 0.0:
         centre = row(geometry.sphere, part)
         ng = normalize(sub(along(origin, direction, distance), centre))
-        point = along(centre, ng, float(geometry.sphere[part, 3]))
+        point = along(centre, ng, np.float64(geometry.sphere[part, 3]))
         ns = ng
     else:
         a, b, c = _corners(geometry, geometry.first[part] + primitive)
@@ -84,7 +84,7 @@ def primvar2(geometry, hit, slot):  # type: ignore[no-untyped-def]
     p = geometry.primvars
     k = first + hit.primitive * stride
     if stride == 0:
-        return True, float(p[k]), float(p[k + 1])
+        return True, np.float64(p[k]), np.float64(p[k + 1])
     w = 1.0 - hit.u - hit.v
     s = w * p[k] + hit.u * p[k + size] + hit.v * p[k + 2 * size]
     t = w * p[k + 1] + hit.u * p[k + size + 1] + hit.v * p[k + 2 * size + 1]
@@ -137,7 +137,7 @@ def _uv_density(geometry, hit, slot):  # type: ignore[no-untyped-def]
 @inlined
 def _textured(geometry, materials, textures, hit, m, i):  # type: ignore[no-untyped-def]
     slot = materials.uv_slot[m, i]
-    s, t = float(materials.uv_value[m, i, 0]), float(materials.uv_value[m, i, 1])
+    s, t = np.float64(materials.uv_value[m, i, 0]), np.float64(materials.uv_value[m, i, 1])
     footprint = 0.0
     if slot >= 0:
         found, x, y = primvar2(geometry, hit, slot)
@@ -166,7 +166,7 @@ def _textured(geometry, materials, textures, hit, m, i):  # type: ignore[no-unty
 def color_input(geometry, materials, textures, hit, m, i):  # type: ignore[no-untyped-def]
     """Value of input `i` of material `m` at a hit, as three floats."""
     if (materials.driven[m] >> i) & 1 == 0:
-        return (float(materials.value[m, i, 0]), float(materials.value[m, i, 1]), float(materials.value[m, i, 2]))
+        return (np.float64(materials.value[m, i, 0]), np.float64(materials.value[m, i, 1]), np.float64(materials.value[m, i, 2]))
     return _driven_color(geometry, materials, textures, hit, m, i)
 
 
@@ -178,9 +178,9 @@ def _driven_color(geometry, materials, textures, hit, m, i):  # type: ignore[no-
     elif materials.primvar_slot[m, i] >= 0:
         found, c = _primvar4(geometry, hit, materials.primvar_slot[m, i])
         if not found:
-            return (float(value[0]), float(value[1]), float(value[2]))
+            return (np.float64(value[0]), np.float64(value[1]), np.float64(value[2]))
     else:
-        return (float(value[0]), float(value[1]), float(value[2]))
+        return (np.float64(value[0]), np.float64(value[1]), np.float64(value[2]))
     s, b = materials.scale[m, i], materials.bias[m, i]
     return (c[0] * s[0] + b[0], c[1] * s[1] + b[1], c[2] * s[2] + b[2])
 
@@ -189,7 +189,7 @@ def _driven_color(geometry, materials, textures, hit, m, i):  # type: ignore[no-
 def float_input(geometry, materials, textures, hit, m, i):  # type: ignore[no-untyped-def]
     """Value of a scalar input `i` of material `m` at a hit."""
     if (materials.driven[m] >> i) & 1 == 0:
-        return float(materials.value[m, i, 0])
+        return np.float64(materials.value[m, i, 0])
     return _driven_float(geometry, materials, textures, hit, m, i)
 
 

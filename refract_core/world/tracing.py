@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from ..kernels.compile import inlined
 from ..kernels.lanes import LANES
 from ..kernels.sampling import hash32
@@ -66,10 +68,10 @@ def _absent(world, packet, lane):  # type: ignore[no-untyped-def]
     if world.materials.cutout[m] == 0:
         return False
     rays = packet.rays
-    u, v = float(rays[HIT_U, lane]), float(rays[HIT_V, lane])
-    origin = (float(rays[0, lane]), float(rays[1, lane]), float(rays[2, lane]))
-    direction = (float(rays[4, lane]), float(rays[5, lane]), float(rays[6, lane]))
-    hit = hit_at(world.geometry, part, primitive, u, v, origin, direction, float(rays[T_FAR, lane]), 0.0)
+    u, v = np.float64(rays[HIT_U, lane]), np.float64(rays[HIT_V, lane])
+    origin = (np.float64(rays[0, lane]), np.float64(rays[1, lane]), np.float64(rays[2, lane]))
+    direction = (np.float64(rays[4, lane]), np.float64(rays[5, lane]), np.float64(rays[6, lane]))
+    hit = hit_at(world.geometry, part, primitive, u, v, origin, direction, np.float64(rays[T_FAR, lane]), 0.0)
     opacity = float_input(world.geometry, world.materials, world.textures, hit, m, Param.OPACITY.value)
     threshold = world.materials.threshold[m]
     if threshold > 0.0:
