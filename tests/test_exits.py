@@ -146,3 +146,19 @@ def test_the_wrong_winding_is_still_a_walk_that_ends() -> None:
     total = np.sum([picture[f"weight.{k}"] for k in ("screen", "ray", "probe", "sky", "none")], axis=0)
     here = picture["mask"] > 0
     np.testing.assert_allclose(total[here], 1.0, atol=1e-5)
+
+
+def test_a_mesh_turned_inside_out_harms_no_other_glass() -> None:
+    """View rays that meet a back face first go on to the next surface; those beside them keep the one they have."""
+    ball = Sphere("/ball", (-0.6, 0.0, 0.0), 0.5, 1)
+    cube = box("/cube", (0.4, 0.4, 0.4), 1, turned((1, 2, 3), 40), (0.6, 0.0, 0.0))
+    wrong = replace(cube, triangles=cube.triangles[:, ::-1].copy())
+    walls, materials = position_room()
+    marble = glass(Model.SPHERE, THICKNESS=1.0)
+    alone = draw(scene(walls, [*materials, marble], [ball]))
+    both = draw(scene([*walls, wrong], [*materials, marble], [ball]))
+    here = alone["mask"] > 0
+    assert here.mean() > 0.05
+    assert ((both["mask"] > 0) & ~here).mean() > 0.05
+    for name in ("beauty", "layers", "mask", "path_length"):
+        np.testing.assert_array_equal(both[name][here], alone[name][here], err_msg=name)

@@ -71,7 +71,7 @@ class Layered:
             self.planes.z_depth[:] = self.opaque.depth
             self.planes.normal[:] = self.opaque.normal
         if inside:  # go on to the first surface entered
-            yield Pass(self._peeling(camera, first, first, []), list(inside))
+            yield Pass(self._peeling(camera, first, first, [], inside=True), inside)
         used = 1
         while busy and used < self.max_layers:
             if used == len(self.layers):
@@ -89,13 +89,13 @@ class Layered:
         yield Pass(lambda tile: add_tile(target, behind, view.size, tile) or 0, self.tiles)
 
     def _peeling(
-        self, camera: Pointer, previous: Pointer, here: Pointer, found: list[int]
+        self, camera: Pointer, previous: Pointer, here: Pointer, found: list[int], *, inside: bool = False
     ) -> Callable[[Tile], int]:
         """Finds the layer behind `previous`; how many pixels have one goes to `found`, tile by tile."""
 
         def peel(tile: Tile) -> int:
             rays, pixels = peel_tile(
-                self.session.world, camera, scratch(ViewScratch), tile, self.opaque.depth, previous, here
+                self.session.world, camera, scratch(ViewScratch), tile, self.opaque.depth, previous, here, inside
             )
             found.append(int(pixels))
             return int(rays)

@@ -204,11 +204,12 @@ def _write_opaque(layer, block, world, view, x0, y0):  # type: ignore[no-untyped
 
 
 @kernel
-def peel_tile(world, view, scratch, tile, depth, previous, layer):  # type: ignore[no-untyped-def]
+def peel_tile(world, view, scratch, tile, depth, previous, layer, inside):  # type: ignore[no-untyped-def]
     """Fill `layer` with the next refractive surface entered behind `previous` and before the opaque `depth`.
 
     `previous.part` of -2 means that the ray starts inside: it must leave before it can enter.
-    `layer` may be `previous` itself. Returns (rays traced, pixels found).
+    `inside`: go on in those pixels only and leave the others as they are; `layer` is then `previous` itself.
+    Returns (rays traced, pixels found).
     """
     packet, far = scratch.packet, scratch.far
     packet.tally[0] = 0
@@ -219,6 +220,8 @@ def peel_tile(world, view, scratch, tile, depth, previous, layer):  # type: igno
             for lane in range(LANES):
                 x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
                 if x >= view.size[0] or y >= view.size[1]:
+                    continue
+                if inside and previous.part[y, x] != -2:
                     continue
                 if previous.part[y, x] != -1:
                     start = previous.distance[y, x] * (1.0 + 1e-5) + 1e-6
