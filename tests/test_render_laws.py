@@ -272,3 +272,24 @@ def test_dispersion_spreads_red_and_blue_around_green() -> None:
     spread = draw(in_positions(glass(Model.TRACED, abbe=20.0), wedge))["refraction"]
     np.testing.assert_allclose(spread[..., 1], plain[..., 1], atol=1e-5)
     assert np.abs(spread[..., 0] - plain[..., 0]).max() > 1e-3
+
+
+@pytest.mark.parametrize("dispersive", [range(1, 12), [8], [9]], ids=["all but the first", "one", "the other"])
+def test_dispersion_belongs_to_the_face_that_is_hit(dispersive: Any) -> None:
+    """Two glasses on one mesh, alike but for the Abbe number. Faces 8 and 9 are the front: each pixel of the two shows
+    what a mesh wholly of the glass it enters would show, whatever the other faces are made of."""
+    cube = box("/cube", (0.6, 0.6, 0.6), 1, turned((1, 2, 0), 20))
+    plain, spread = glass(Model.TRACED), glass(Model.TRACED, abbe=20.0)
+    materials = np.ones(12, np.int32)
+    materials[list(dispersive)] = 2
+    walls, base = position_room()
+
+    def drawn(of: Any) -> F32:
+        return draw(scene([*walls, replace(cube, materials=of)], [*base, plain, spread]))["refraction"]
+
+    mixed, none, whole = drawn(materials), drawn(np.ones(12, np.int32)), drawn(np.full(12, 2, np.int32))
+    through = np.abs(whole - none).max(-1) > 1e-3
+    as_whole, as_none = (mixed == whole).all(-1), (mixed == none).all(-1)
+    assert (as_whole | as_none).all()
+    assert (through & as_whole).sum() > 10
+    assert (through & as_none).any() == (len(dispersive) == 1)

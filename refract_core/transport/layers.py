@@ -111,7 +111,7 @@ def refract_tile(world, screen, probes, thing_probe, choices, scratch, tile, sam
             if not some:
                 continue
             gather(block, packet, world, sample, OPAQUE)
-            channels = _dispersive(exits, parts, world, block)
+            channels = _dispersive(block, layer, world, x0, y0)
             for channel in range(channels):
                 if channels > 1:
                     _reload(block, exits, layer, world, view, choices, x0, y0)
@@ -174,12 +174,13 @@ def _reload(block, exits, layer, world, view, choices, x0, y0):  # type: ignore[
 
 
 @inlined
-def _dispersive(exits, parts, world, block):  # type: ignore[no-untyped-def]
-    """3 where some lane's material disperses, else 1."""
+def _dispersive(block, layer, world, x0, y0):  # type: ignore[no-untyped-def]
+    """3 where the material that some lane has hit disperses, else 1."""
     for lane in range(LANES):
         if block.on[lane] != 0:
-            first = world.geometry.first[parts[lane]]
-            if world.materials.abbe[world.geometry.material[first]] > 0.0:
+            x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
+            m = material_of(world.geometry, layer.part[y, x], layer.primitive[y, x])
+            if world.materials.abbe[m] > 0.0:
                 return 3
     return 1
 
