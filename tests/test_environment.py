@@ -12,7 +12,7 @@ from refract_core.errors import SceneError
 from refract_core.kernels.compile import kernel
 from refract_core.scene import F32, F64, Environment
 from refract_core.world import environment as env
-from refract_core.world.inversion import guide_of, pick
+from refract_core.world.environment import guide_of, pick
 
 AXES = {
     "+x": (1.0, 0.0, 0.0),

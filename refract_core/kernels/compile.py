@@ -13,10 +13,12 @@ import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
 
+T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
 
 _ENGINE = Path(__file__).parents[1]
@@ -45,13 +47,13 @@ def _cache_folder(module: str) -> str:
     return str(cache_root() / "kernels" / f"{room}-{digest.hexdigest()[:16]}")
 
 
-def kernel(function: F) -> F:
+def kernel(function: Callable[..., T]) -> Callable[..., T]:
     """Compile `function` with numba when first called (or load it), to run without the GIL.
 
     Division by zero gives inf or NaN as in numpy, never an exception: a ray that fails is a status.
     """
     numba.config.CACHE_DIR = _cache_folder(function.__module__)
-    compiled: F = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath=FASTMATH)(function)
+    compiled: Callable[..., T] = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath=FASTMATH)(function)
     return compiled
 
 
@@ -73,6 +75,19 @@ def leaf(function: F) -> F:
         _nrt=False, forceinline=True, nogil=True, error_model="numpy", fastmath=FASTMATH, no_cfunc_wrapper=True
     )(function)
     return compiled
+
+
+def word(value: int) -> int:
+    """A constant that kernels pass to functions as an argument, as a 64-bit integer.
+
+    numba compiles a function anew for every Python number it is called with; one of numpy's is a value like any other.
+    """
+    return cast(int, np.int64(value))
+
+
+def flag(value: bool) -> bool:
+    """The same for a switch."""
+    return cast(bool, np.bool_(value))
 
 
 def is_compiled(compiled: Callable[..., Any]) -> bool:

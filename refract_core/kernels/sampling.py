@@ -28,6 +28,12 @@ def hash32(x, y, purpose):  # type: ignore[no-untyped-def]
 
 
 @inlined
+def chance_of_bits(a: int, b: int, c: int) -> float:
+    """A number in [0, 1) that depends on three integers alone, as on the bits of a ray."""
+    return hash32(a, b, c) * _TO_UNIT
+
+
+@inlined
 def unit_pair(x, y, sample, purpose):  # type: ignore[no-untyped-def]
     """Point `sample` of the pixel's rotated R2 sequence in [0, 1)^2, for one purpose (a light, a lobe, ...)."""
     u = hash32(x, y, 2 * purpose) * _TO_UNIT + sample * _A1

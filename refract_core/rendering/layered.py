@@ -11,7 +11,8 @@ from ..kernels.lanes import scratch
 from ..kernels.pointer import Pointer
 from ..scene import Model, Scene
 from ..settings import TIERS, RenderSettings
-from ..transport.layers import Choices, LayerScratch, new_layer_result, put_tile, refract_tile
+from ..transport.layers import LayerScratch, new_layer_result, put_tile, refract_tile
+from ..transport.tiers import Asking
 from ..view.camera import View
 from ..view.gbuffer import (
     OpaqueLayer,
@@ -34,10 +35,10 @@ class Layered:
         self, session: Session, scene: Scene, settings: RenderSettings, tiles: list[Tile], planes: Planes
     ) -> None:
         height, width = planes.mask.shape
-        order = np.array([TIERS.index(t) for t in settings.tiers], np.int32)
-        model = int(Model[settings.model.upper()]) if settings.model else -1
         self.session, self.tiles, self.planes = session, tiles, planes
-        self.choices = Choices(order, settings.screen == "proxy", model)
+        self.order = np.array([TIERS.index(t) for t in settings.tiers], np.int32)
+        self.by_proxy = settings.screen == "proxy"
+        self.model = int(Model[settings.model.upper()]) if settings.model else -1
         self.max_layers = settings.max_layers
         self.screen = new_screen_buffers(width, height, is_rough(scene))
         # The opaque layer is level 0 of the screen's pyramids.
@@ -105,7 +106,7 @@ class Layered:
     def _composited(self, view: View, sample: int, k: int, busy: list[Tile]) -> Iterator[Pass]:
         """Draw layer `k` from the picture as it is behind it, then put it into the picture."""
         screen, session = self.screen, self.session
-        if TIERS.index("screen") in self.choices.tiers:
+        if TIERS.index("screen") in self.order:
             blurs = range(1, len(screen.color_level))
 
             def levels() -> None:
@@ -116,14 +117,16 @@ class Layered:
                     blur_level(screen.color, screen.color_level, level)
 
             yield Pass(_without_rays, [levels, blur])
-        buffers, chosen = Pointer(Screen(view, *screen)), Pointer(self.choices)
+        asking = Pointer(
+            Asking(self.order, self.by_proxy, Screen(view, *screen), session.probes.record, session.thing_probe)
+        )
         layer, result, planes = Pointer(self.layers[k]), Pointer(self.result), Pointer(self.planes)
 
         def refract(tile: Tile) -> int:
             return int(
                 refract_tile(
-                    session.world, buffers, session.probes, session.thing_probe, chosen, scratch(LayerScratch), tile,
-                    sample, layer, result, planes, k == 0,
+                    session.world, asking, self.model, scratch(LayerScratch), tile, sample, layer, result, planes,
+                    k == 0,
                 )
             )  # fmt: skip
 

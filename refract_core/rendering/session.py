@@ -20,8 +20,7 @@ from ..settings import RenderSettings
 from ..world import environment, textures
 from ..world.embree import Bvh
 from ..world.lights import pack_lights
-from ..world.tables import pack_geometry, pack_materials
-from ..world.tracing import world_of
+from ..world.tables import pack_geometry, pack_materials, world_of
 from .work import Cancel, Progress, Work, working
 
 _PROBE_SAMPLES = 4

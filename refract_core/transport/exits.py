@@ -13,25 +13,40 @@ from typing import NamedTuple
 import numpy as np
 
 from ..kernels.compile import inlined
-from ..kernels.lanes import LANES, Flags, Pairs, Scalars, Vectors, Words, put
-from ..kernels.vec import along, dot, flip_towards, mul, normalize, row, scale, sub
+from ..kernels.lanes import LANES, Flags, Scalars, Vectors, Words, put
+from ..kernels.vec import Vec, along, dot, flip_towards, mul, normalize, row, scale, sub
 from ..optics.interface import THIN_THICKNESS, box_model, reflect, refract, sphere_model, thin_model, transmittance
 from ..scene import Model, Param
 from ..world.embree import (
     COHERENT,
-    GEOM,
-    HIT_U,
-    HIT_V,
     OPAQUE,
-    PRIM,
     REFRACTIVE,
     SCATTERED,
-    T_FAR,
+    Packet,
     clear,
+    has_hit,
+    hit_distance,
+    ray_direction,
+    ray_origin,
     set_ray,
 )
-from ..world.surface import color_input, float_input, hit_at, material_of, normal_input
-from ..world.tracing import intersect_world, off_surface
+from ..world.offsets import off_surface, tie
+from ..world.shading import Block
+from ..world.surface import (
+    NOTHING,
+    HitLanes,
+    Interaction,
+    Ray,
+    color_input,
+    float_input,
+    hit_in,
+    interaction,
+    keep_hit,
+    kept_hit,
+    normal_input,
+)
+from ..world.tables import World
+from ..world.tracing import intersect_world
 
 MAX_EVENTS = 24
 """Interfaces that one walked ray may meet."""
@@ -48,6 +63,9 @@ class Exits(NamedTuple):
     on: Flags
     model: Words
     ior: Scalars
+    """authored, >= 1"""
+    ior_now: Scalars
+    """ior of the medium the ray is in: the authored one, or a colour channel's under dispersion"""
     thickness: Scalars
     """authored [m]"""
     color: Vectors
@@ -66,44 +84,40 @@ class Exits(NamedTuple):
     inside: Words
     """part number of the medium the ray is in, or -1"""
     segment: Scalars
-    """T_FAR to start with"""
-    hit: Vectors
-    """u, v and distance of the interface a walk has met"""
-    met: Pairs
-    """its part, -1 for none, and primitive"""
+    """T_FAR of the rays in the packet, to start with [m]"""
+    met: HitLanes
+    """the interface a walk has met, until it has been dealt with"""
     unanswered: Scalars
     """the share of the light from the exit that no tier knew"""
 
 
 @inlined
-def load_medium(exits, lane, hit, world, override):  # type: ignore[no-untyped-def]
+def load_medium(exits: Exits, lane: int, at: Interaction, world: World, override: int) -> None:
     """Look up the refraction attributes at an entry. `override`: a `Model` for every material, or -1."""
-    g, mt, tx = world.geometry, world.materials, world.textures
-    m = material_of(g, hit.part, hit.primitive)
-    model = mt.model[m] if override < 0 else override
-    if model == Model.TRACED.value and g.sheet[hit.part] != 0:
+    m = at.hit.material
+    model = world.materials.model[m] if override < 0 else override
+    if model == Model.TRACED.value and world.geometry.sheet[at.hit.part] != 0:
         model = Model.THIN.value  # an open mesh has no far side to find; `open_meshes` says so to the user
-    thickness = max(MIN_THICKNESS, float_input(g, mt, tx, hit, m, Param.THICKNESS.value))
-    distance = np.float64(mt.absorption_distance[m])
+    thickness = max(MIN_THICKNESS, float_input(world, at, Param.THICKNESS.value))
+    distance: float = np.float64(world.materials.absorption_distance[m])
     if model == Model.THIN.value:
         thickness = distance = THIN_THICKNESS
     exits.on[lane] = 1
     exits.model[lane] = model
-    exits.ior[lane] = max(1.0, float_input(g, mt, tx, hit, m, Param.IOR.value))
+    exits.ior[lane] = max(1.0, float_input(world, at, Param.IOR.value))
     exits.thickness[lane] = thickness
     exits.absorption_distance[lane] = distance
-    put(exits.color, lane, color_input(g, mt, tx, hit, m, Param.TRANSMITTANCE.value))
+    put(exits.color, lane, color_input(world, at, Param.TRANSMITTANCE.value))
 
 
 @inlined
-def find_exits(exits, block, hits, packet, world, ior, measured):  # type: ignore[no-untyped-def]
+def find_exits(exits: Exits, block: Block, parts: Words, packet: Packet, world: World, measured: bool) -> None:
     """Fill point, direction, path_length, transmittance and status of every lane that is on.
 
     Args:
         measured: look for opaque objects between a model's entry and exit, which HDRP does not.
         block: the entries: point, ng, ns (on the viewer's side), wo.
-        hits: shape (8,) part numbers of the entries.
-        ior: shape (8,), the index to use (a colour channel's, under dispersion).
+        parts: of the entries.
     """
     walks = False
     for lane in range(LANES):
@@ -111,17 +125,17 @@ def find_exits(exits, block, hits, packet, world, ior, measured):  # type: ignor
         if exits.on[lane] == 0:
             continue
         p, n, wo = row(block.point, lane), row(block.ns, lane), row(block.wo, lane)
-        model = exits.model[lane]
+        model, ior = exits.model[lane], exits.ior_now[lane]
         if model == Model.TRACED.value:
             walks = True
-            _start_walk(exits, lane, block, hits[lane], p, n, wo, ior[lane])
+            _start_walk(exits, lane, block, parts[lane])
             continue
         if model == Model.SPHERE.value:
-            length, point, direction = sphere_model(p, n, wo, ior[lane], exits.thickness[lane])
+            length, point, direction = sphere_model(p, n, wo, ior, exits.thickness[lane])
         elif model == Model.BOX.value:
-            length, point, direction = box_model(p, n, wo, ior[lane], exits.thickness[lane])
+            length, point, direction = box_model(p, n, wo, ior, exits.thickness[lane])
         elif model == Model.THIN.value:
-            length, point, direction = thin_model(p, n, wo, ior[lane])
+            length, point, direction = thin_model(p, n, wo, ior)
         else:
             length, point, direction = 0.0, p, scale(wo, -1.0)
         put(exits.point, lane, point)
@@ -132,11 +146,11 @@ def find_exits(exits, block, hits, packet, world, ior, measured):  # type: ignor
     if measured:
         _stop_at_opaque(exits, block, packet, world)
     if walks:
-        _walk(exits, packet, world, ior)
+        _walk(exits, packet, world)
 
 
 @inlined
-def _stop_at_opaque(exits, block, packet, world):  # type: ignore[no-untyped-def]
+def _stop_at_opaque(exits: Exits, block: Block, packet: Packet, world: World) -> None:
     """A typed thickness may reach through the floor the glass stands on: such rays are EMBEDDED, as in a walk."""
     clear(packet)
     for lane in range(LANES):
@@ -148,24 +162,25 @@ def _stop_at_opaque(exits, block, packet, world):  # type: ignore[no-untyped-def
         set_ray(packet, lane, off_surface(p, row(block.ng, lane), inside), inside, 0.0, exits.segment[lane], OPAQUE)
     intersect_world(packet, world, exits.segment, COHERENT)
     for lane in range(LANES):
-        if packet.valid[lane] == 0 or packet.words[GEOM, lane] < 0:
+        if not has_hit(packet, lane):
             continue
-        t = np.float64(packet.rays[T_FAR, lane])
-        rays = packet.rays
+        t = hit_distance(packet, lane)
         exits.status[lane] = EMBEDDED
-        put(exits.point, lane, (np.float64(rays[0, lane]), np.float64(rays[1, lane]), np.float64(rays[2, lane])))
-        put(exits.direction, lane, (np.float64(rays[4, lane]), np.float64(rays[5, lane]), np.float64(rays[6, lane])))
+        put(exits.point, lane, ray_origin(packet, lane))
+        put(exits.direction, lane, ray_direction(packet, lane))
         exits.path_length[lane] = t
         put(exits.transmittance, lane, transmittance(row(exits.color, lane), exits.absorption_distance[lane], t))
 
 
 @inlined
-def _start_walk(exits, lane, block, part, p, n, wo, ior):  # type: ignore[no-untyped-def]
-    _, inside = refract(scale(wo, -1.0), n, 1.0 / ior)
-    ng = row(block.ng, lane)
+def _start_walk(exits: Exits, lane: int, block: Block, part: int) -> None:
+    """Enter the medium of `part` at the block's surface."""
+    n, ng, wo = row(block.ns, lane), row(block.ng, lane), row(block.wo, lane)
+    eta_i_over_t = 1.0 / exits.ior_now[lane]
+    _, inside = refract(scale(wo, -1.0), n, eta_i_over_t)
     if dot(inside, ng) >= 0.0:  # a steep shading normal must not send the ray back out
-        _, inside = refract(scale(wo, -1.0), ng, 1.0 / ior)
-    put(exits.point, lane, off_surface(p, ng, inside))
+        _, inside = refract(scale(wo, -1.0), ng, eta_i_over_t)
+    put(exits.point, lane, off_surface(row(block.point, lane), ng, inside))
     put(exits.direction, lane, inside)
     exits.path_length[lane] = 0.0
     put(exits.transmittance, lane, (1.0, 1.0, 1.0))
@@ -174,7 +189,7 @@ def _start_walk(exits, lane, block, part, p, n, wo, ior):  # type: ignore[no-unt
 
 
 @inlined
-def _walk(exits, packet, world, ior):  # type: ignore[no-untyped-def]
+def _walk(exits: Exits, packet: Packet, world: World) -> None:
     """Follow every lane whose status is LOST until it leaves for good."""
     for event in range(MAX_EVENTS):
         clear(packet)
@@ -188,103 +203,110 @@ def _walk(exits, packet, world, ior):  # type: ignore[no-untyped-def]
             set_ray(packet, lane, p, d, 0.0, math.inf, REFRACTIVE | OPAQUE)
         if not waiting:
             break
-        intersect_world(packet, world, exits.segment, np.bool_(event == 0))
+        intersect_world(packet, world, exits.segment, COHERENT if event == 0 else SCATTERED)
         _note_interfaces(exits, packet, world)
         for lane in range(LANES):
             if exits.on[lane] != 0 and exits.status[lane] == LOST:
-                _meet(exits, lane, world, ior)
+                _meet(exits, lane, world)
 
 
 @inlined
-def _note_interfaces(exits, packet, world):  # type: ignore[no-untyped-def]
+def _note_interfaces(exits: Exits, packet: Packet, world: World) -> None:
     """Keep what a walk's rays have met. Where glass touches an opaque object, as on a table, the two surfaces tie and
     the ray could come out on the far side of the table: an opaque surface within rounding of the hit takes it."""
     for lane in range(LANES):
-        exits.met[lane, 0] = -1
-        if packet.valid[lane] == 0:
-            continue
-        _keep_interface(exits, packet, lane)
-        t = exits.hit[lane, 2]
+        exits.met.part[lane] = NOTHING
+        found = has_hit(packet, lane)
         packet.valid[lane] = 0
-        if exits.met[lane, 0] >= 0 and exits.inside[lane] >= 0:
+        if not found:
+            continue
+        hit = hit_in(packet, lane, world.geometry)
+        keep_hit(exits.met, lane, hit)
+        if exits.inside[lane] >= 0:
             p, d = row(exits.point, lane), row(exits.direction, lane)
-            end = along(p, d, t)
-            near = 4e-5 * max(abs(end[0]), abs(end[1]), abs(end[2])) + 4e-6
-            exits.segment[lane] = t + near
-            set_ray(packet, lane, p, d, max(0.0, t - near), t + near, OPAQUE)
+            near = tie(along(p, d, hit.t))
+            exits.segment[lane] = hit.t + near
+            set_ray(packet, lane, p, d, max(0.0, hit.t - near), hit.t + near, OPAQUE)
     intersect_world(packet, world, exits.segment, SCATTERED)
     for lane in range(LANES):
-        if packet.valid[lane] != 0 and packet.words[GEOM, lane] >= 0:
-            _keep_interface(exits, packet, lane)
+        if has_hit(packet, lane):
+            keep_hit(exits.met, lane, hit_in(packet, lane, world.geometry))
 
 
 @inlined
-def _keep_interface(exits, packet, lane):  # type: ignore[no-untyped-def]
-    exits.met[lane, 0], exits.met[lane, 1] = packet.words[GEOM, lane], packet.words[PRIM, lane]
-    exits.hit[lane, 0], exits.hit[lane, 1] = packet.rays[HIT_U, lane], packet.rays[HIT_V, lane]
-    exits.hit[lane, 2] = packet.rays[T_FAR, lane]
-
-
-@inlined
-def _meet(exits, lane, world, ior):  # type: ignore[no-untyped-def]
-    """One interface of a walk."""
-    part, primitive = exits.met[lane, 0], exits.met[lane, 1]
+def _meet(exits: Exits, lane: int, world: World) -> None:
+    """One interface of a walk: out of the medium, into another, past what is neither, or onto something opaque."""
     inside = exits.inside[lane]
-    if part < 0:
+    hit = kept_hit(exits.met, lane)
+    if hit.part == NOTHING:
         exits.status[lane] = LEFT
         return
-    g, mt, tx = world.geometry, world.materials, world.textures
-    m = material_of(g, part, primitive)
-    t = exits.hit[lane, 2]
-    p, d = row(exits.point, lane), row(exits.direction, lane)
-    if mt.model[m] == Model.NONE.value:
+    model = world.materials.model[hit.material]
+    if model == Model.NONE.value:
         exits.status[lane] = LEFT if inside < 0 else EMBEDDED
         if inside >= 0:
-            _absorb(exits, lane, t)
+            _absorb(exits, lane, hit.t)
         return
-    hit = hit_at(g, part, primitive, exits.hit[lane, 0], exits.hit[lane, 1], p, d, t, 0.0)
-    leaving = dot(hit.ng, d) > 0.0
-    same = inside >= 0 and g.thing[part] == g.thing[inside]
-    if inside >= 0 and same and leaving:
-        _absorb(exits, lane, t)
-        n = scale(flip_towards(normal_input(g, mt, tx, hit, m), hit.ng), -1.0)
-        ok, out = refract(d, n, ior[lane])
-        if ok and dot(out, hit.ng) > 0.0:
-            exits.inside[lane] = -1
-        else:
-            out = reflect(d, n)
-            if dot(out, hit.ng) > 0.0:
-                out = reflect(d, scale(hit.ng, -1.0))
-        _go_on(exits, lane, hit, out)
-    elif inside < 0 and not leaving and g.sheet[part] == 0 and mt.model[m] != Model.THIN.value:
-        ior[lane] = max(1.0, float_input(g, mt, tx, hit, m, Param.IOR.value))
-        exits.absorption_distance[lane] = mt.absorption_distance[m]
-        put(exits.color, lane, color_input(g, mt, tx, hit, m, Param.TRANSMITTANCE.value))
-        n = flip_towards(normal_input(g, mt, tx, hit, m), hit.ng)
-        _, within = refract(d, n, 1.0 / ior[lane])
-        if dot(within, hit.ng) >= 0.0:
-            _, within = refract(d, hit.ng, 1.0 / ior[lane])
-        exits.inside[lane] = part
-        _go_on(exits, lane, hit, within)
-    else:
+    d = row(exits.direction, lane)
+    at = interaction(world.geometry, hit, Ray(row(exits.point, lane), d), 0.0)
+    leaving = dot(at.ng, d) > 0.0
+    thing, sheet = world.geometry.thing, world.geometry.sheet
+    if inside >= 0 and thing[hit.part] == thing[inside] and leaving:
+        _absorb(exits, lane, hit.t)
+        _leave(exits, lane, at, world)
+    elif inside < 0 and not leaving and sheet[hit.part] == 0 and model != Model.THIN.value:
+        _enter(exits, lane, at, world)
+    else:  # another thing's surface within this one, a pane, a sheet: the ray goes straight on
         if inside >= 0:
-            _absorb(exits, lane, t)
-        elif mt.model[m] == Model.THIN.value or g.sheet[part] != 0:
-            cosine = max(1e-3, abs(dot(hit.ng, d)))
-            tint = color_input(g, mt, tx, hit, m, Param.TRANSMITTANCE.value)
+            _absorb(exits, lane, hit.t)
+        elif model == Model.THIN.value or sheet[hit.part] != 0:
+            cosine = max(1e-3, abs(dot(at.ng, d)))
+            tint = color_input(world, at, Param.TRANSMITTANCE.value)
             through = transmittance(tint, THIN_THICKNESS, THIN_THICKNESS / cosine)
             put(exits.transmittance, lane, mul(row(exits.transmittance, lane), through))
-        _go_on(exits, lane, hit, d)
+        _go_on(exits, lane, at, d)
 
 
 @inlined
-def _absorb(exits, lane, length):  # type: ignore[no-untyped-def]
+def _leave(exits: Exits, lane: int, at: Interaction, world: World) -> None:
+    """From the medium out into the air, or back into it by total internal reflection."""
+    d = row(exits.direction, lane)
+    n = scale(flip_towards(normal_input(world, at), at.ng), -1.0)
+    ok, out = refract(d, n, exits.ior_now[lane])
+    if ok and dot(out, at.ng) > 0.0:
+        exits.inside[lane] = NOTHING
+    else:
+        out = reflect(d, n)
+        if dot(out, at.ng) > 0.0:  # a steep shading normal must not send it out all the same
+            out = reflect(d, scale(at.ng, -1.0))
+    _go_on(exits, lane, at, out)
+
+
+@inlined
+def _enter(exits: Exits, lane: int, at: Interaction, world: World) -> None:
+    """From the air into the medium of what was hit, whose absorption and ior count from here on."""
+    d = row(exits.direction, lane)
+    exits.ior_now[lane] = max(1.0, float_input(world, at, Param.IOR.value))
+    exits.absorption_distance[lane] = world.materials.absorption_distance[at.hit.material]
+    put(exits.color, lane, color_input(world, at, Param.TRANSMITTANCE.value))
+    n = flip_towards(normal_input(world, at), at.ng)
+    _, within = refract(d, n, 1.0 / exits.ior_now[lane])
+    if dot(within, at.ng) >= 0.0:
+        _, within = refract(d, at.ng, 1.0 / exits.ior_now[lane])
+    exits.inside[lane] = at.hit.part
+    _go_on(exits, lane, at, within)
+
+
+@inlined
+def _absorb(exits: Exits, lane: int, length: float) -> None:
+    """`length` metres of the medium the ray is in (Beer-Lambert)."""
     exits.path_length[lane] += length
     through = transmittance(row(exits.color, lane), exits.absorption_distance[lane], length)
     put(exits.transmittance, lane, mul(row(exits.transmittance, lane), through))
 
 
 @inlined
-def _go_on(exits, lane, hit, direction):  # type: ignore[no-untyped-def]
-    put(exits.point, lane, off_surface(hit.point, hit.ng, direction))
+def _go_on(exits: Exits, lane: int, at: Interaction, direction: Vec) -> None:
+    """Restart the ray at a surface."""
+    put(exits.point, lane, off_surface(at.point, at.ng, direction))
     put(exits.direction, lane, direction)

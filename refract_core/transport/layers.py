@@ -12,44 +12,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels.compile import inlined, kernel
-from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Scalars, Vectors, Words
+from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Scalars, Vectors, Words, put
 from ..kernels.vec import dot, row, scale
 from ..optics.interface import channel_iors, fresnel_dielectric, reflect, transmitted_roughness
 from ..scene import Param
-from ..view.gbuffer import view_point
-from ..world.embree import OPAQUE, Packet
+from ..view.camera import View
+from ..view.gbuffer import OpaqueLayer, RefractiveLayer, Tile, view_point
+from ..view.planes import Planes
+from ..world.embree import OPAQUE
+from ..world.offsets import off_surface
 from ..world.shading import Block, gather, load_surface
-from ..world.surface import float_input, material_of
-from ..world.tracing import off_surface
+from ..world.surface import NOTHING, share_input
+from ..world.tables import World
 from .exits import EMBEDDED, LOST, Exits, find_exits, load_medium
-from .tiers import BY_MARCH, Query, ask
+from .tiers import BY_MARCH, NONE, PROBE, RAY, SCREEN, SKY, Asking, Query, TierScratch, ask
 
-
-class Choices(NamedTuple):
-    """What the settings come to, for kernels."""
-
-    tiers: NDArray[np.int32]
-    """tier codes in the order asked"""
-    hdrp: bool
-    """screen tier by proxy"""
-    model: int
-    """override for every refractive material, or -1"""
+_RED, _GREEN, _BLUE = 0, 1, 2
 
 
 class LayerScratch(NamedTuple):
     """What one thread needs to draw a block of a layer."""
 
-    packet: Packet
+    work: TierScratch
     block: Block
-    second: Block
-    third: Block
+    """the layer's surfaces"""
     exits: Exits
     query: Query
     parts: Words
-    ior: Scalars
-    z_self: Scalars
     opacity: Scalars
     through: Vectors
+    """radiance that comes through, before Fresnel"""
 
 
 class LayerResult(NamedTuple):
@@ -75,11 +67,13 @@ def new_layer_result(width: int, height: int) -> LayerResult:
 
 
 @kernel
-def put_tile(layer, result, opaque, size, tile):  # type: ignore[no-untyped-def]
-    """Draw a composited layer into the picture (an OpaqueLayer), where it is."""
+def put_tile(
+    layer: RefractiveLayer, result: LayerResult, opaque: OpaqueLayer, size: NDArray[np.int64], tile: Tile
+) -> None:
+    """Draw a composited layer into the picture, where it is."""
     for y in range(tile[1], min(tile[3], size[1])):
         for x in range(tile[0], min(tile[2], size[0])):
-            if layer.part[y, x] < 0:
+            if layer.part[y, x] == NOTHING:
                 continue
             for c in range(3):
                 opaque.color[y, x, c] = result.color[y, x, c]
@@ -89,133 +83,144 @@ def put_tile(layer, result, opaque, size, tile):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _tan_of_lobe(roughness):  # type: ignore[no-untyped-def]
+def _tan_of_lobe(roughness: float) -> float:
     """Tangent of the half angle within which a reflected GGX lobe keeps half of its rays: twice the median slope."""
     return 2.0 * roughness * roughness
 
 
 @kernel
-def refract_tile(world, screen, probes, thing_probe, choices, scratch, tile, sample, layer, result, planes, front):  # type: ignore[no-untyped-def]
-    """Composite `layer` over what `screen` holds, into `result`, over a tile (x0, y0, x1, y1). Returns rays traced.
+def refract_tile(
+    world: World,
+    asking: Asking,
+    model: int,
+    scratch: LayerScratch,
+    tile: Tile,
+    sample: int,
+    layer: RefractiveLayer,
+    result: LayerResult,
+    planes: Planes,
+    front: bool,
+) -> int:
+    """Composite `layer` over what the screen holds, into `result`, over a tile. Returns rays traced.
 
-    `front`: this is the nearest layer, whose parts go into `planes`.
+    Args:
+        model: a `scene.Model` for every refractive material, or -1 for their own.
+        front: this is the nearest layer, whose parts go into `planes`.
     """
-    packet, block, second, third = scratch.packet, scratch.block, scratch.second, scratch.third
-    exits, query, parts, ior = scratch.exits, scratch.query, scratch.parts, scratch.ior
-    z_self, opacity, through = scratch.z_self, scratch.opacity, scratch.through
-    packet.tally[0] = 0
-    view = screen.camera
+    work, block, exits, query = scratch.work, scratch.block, scratch.exits, scratch.query
+    work.packet.tally[0] = 0
     for y0 in range(tile[1], tile[3], BLOCK_HEIGHT):
         for x0 in range(tile[0], tile[2], BLOCK_WIDTH):
-            some = _load_entries(block, exits, layer, world, view, choices, x0, y0, parts, z_self, opacity)
-            if not some:
+            if not _load_entries(scratch, layer, world, asking.screen.camera, model, x0, y0):
                 continue
-            gather(block, packet, world, sample, OPAQUE)
-            channels = _dispersive(block, layer, world, x0, y0)
-            for channel in range(channels):
-                if channels > 1:
-                    _reload(block, exits, layer, world, view, choices, x0, y0)
-                _set_iors(exits, world, layer, x0, y0, ior, channel if channels > 1 else 1)
-                find_exits(exits, block, parts, packet, world, ior, not choices.hdrp)
-                _query_exits(query, exits, block, parts, world)
-                ask(query, choices.tiers, choices.hdrp, screen, probes, thing_probe, z_self, block, second, third,
-                    packet, world, sample)  # fmt: skip
+            gather(block, work.packet, world, sample, OPAQUE)
+            # A colour that bends differently takes a way of its own: under dispersion each channel is walked alone.
+            disperses = _disperses(block, layer, world, x0, y0)
+            for channel in range(3 if disperses else 1):
+                if disperses:
+                    _reload(scratch, layer, world, asking.screen.camera, model, x0, y0)
+                _set_index(exits, world, layer, x0, y0, channel if disperses else _GREEN)
+                find_exits(exits, block, scratch.parts, work.packet, world, not asking.by_proxy)
+                _query_exits(scratch, world)
+                ask(query, asking, asking.by_proxy, work, world, sample)
                 for lane in range(LANES):
                     if query.on[lane] == 0:
                         continue
                     t = row(exits.transmittance, lane)
                     for c in range(3):
-                        if channels == 1 or c == channel:
-                            through[lane, c] = query.color[lane, c] * t[c]
-                if channels == 1 or channel == 1:
+                        if not disperses or c == channel:
+                            scratch.through[lane, c] = query.color[lane, c] * t[c]
+                if not disperses or channel == _GREEN:
                     _note_transmission(planes, front, sample, query, exits, x0, y0)
-            _query_reflections(query, block, parts, world)
-            ask(query, choices.tiers, BY_MARCH, screen, probes, thing_probe, z_self, block, second, third,
-                packet, world, sample)  # fmt: skip
-            _composite(result, planes, front, sample, query, exits, block, through, opacity, z_self, x0, y0)
-    return packet.tally[0]
+            _query_reflections(scratch, world)
+            ask(query, asking, BY_MARCH, work, world, sample)
+            _composite(result, planes, front, sample, scratch, x0, y0)
+    return work.packet.tally[0]
 
 
 @inlined
-def _load_entries(block, exits, layer, world, view, choices, x0, y0, parts, z_self, opacity):  # type: ignore[no-untyped-def]
+def _load_entries(
+    scratch: LayerScratch, layer: RefractiveLayer, world: World, view: View, model: int, x0: int, y0: int
+) -> bool:
     """Look at the layer's surface in every pixel of a block. False if there is none."""
+    block, exits, query = scratch.block, scratch.exits, scratch.query
     some = False
     for lane in range(LANES):
         x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
         block.on[lane] = exits.on[lane] = 0
-        if x >= view.size[0] or y >= view.size[1] or layer.part[y, x] < 0:
+        if x >= view.size[0] or y >= view.size[1] or layer.part[y, x] == NOTHING:
             continue
         some = True
-        hit, direction, z = view_point(view, layer, world, x, y)
-        m = material_of(world.geometry, hit.part, hit.primitive)
+        at, direction, z = view_point(view, layer, world, x, y)
         block.on[lane] = 1
         block.pixel[lane, 0], block.pixel[lane, 1] = x, y
-        load_surface(block, lane, hit, world, scale(direction, -1.0))
-        ns = row(block.ns, lane)
-        if dot(ns, direction) >= 0.0:  # interpolated normals may face away at silhouettes
-            ng = row(block.ng, lane)
-            for c in range(3):
-                block.ns[lane, c] = ng[c]
-        load_medium(exits, lane, hit, world, choices.model)
-        parts[lane] = hit.part
-        z_self[lane] = z
-        value = float_input(world.geometry, world.materials, world.textures, hit, m, Param.OPACITY.value)
-        opacity[lane] = min(1.0, max(0.0, value))
+        query.pixel[lane, 0], query.pixel[lane, 1] = x, y
+        load_surface(block, lane, at, world, scale(direction, -1.0))
+        if dot(row(block.ns, lane), direction) >= 0.0:  # interpolated normals may face away at silhouettes
+            put(block.ns, lane, row(block.ng, lane))
+        load_medium(exits, lane, at, world, model)
+        scratch.parts[lane] = at.hit.part
+        query.z_self[lane] = z
+        scratch.opacity[lane] = share_input(world, at, Param.OPACITY.value)
     return some
 
 
 @inlined
-def _reload(block, exits, layer, world, view, choices, x0, y0):  # type: ignore[no-untyped-def]
+def _reload(
+    scratch: LayerScratch, layer: RefractiveLayer, world: World, view: View, model: int, x0: int, y0: int
+) -> None:
     """Undo what a walk through other media left in `exits`."""
     for lane in range(LANES):
-        if block.on[lane] != 0:
-            hit, _, _ = view_point(view, layer, world, x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH)
-            load_medium(exits, lane, hit, world, choices.model)
+        if scratch.block.on[lane] != 0:
+            at, _, _ = view_point(view, layer, world, x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH)
+            load_medium(scratch.exits, lane, at, world, model)
 
 
 @inlined
-def _dispersive(block, layer, world, x0, y0):  # type: ignore[no-untyped-def]
-    """3 where the material that some lane has hit disperses, else 1."""
+def _disperses(block: Block, layer: RefractiveLayer, world: World, x0: int, y0: int) -> bool:
+    """The material that some lane has hit disperses."""
     for lane in range(LANES):
         if block.on[lane] != 0:
             x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
-            m = material_of(world.geometry, layer.part[y, x], layer.primitive[y, x])
-            if world.materials.abbe[m] > 0.0:
-                return 3
-    return 1
+            if world.materials.abbe[layer.material[y, x]] > 0.0:
+                return True
+    return False
 
 
 @inlined
-def _set_iors(exits, world, layer, x0, y0, ior, channel):  # type: ignore[no-untyped-def]
+def _set_index(exits: Exits, world: World, layer: RefractiveLayer, x0: int, y0: int, channel: int) -> None:
+    """The ior that a colour channel finds; green has the authored one."""
     for lane in range(LANES):
         if exits.on[lane] == 0:
             continue
         x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
-        m = material_of(world.geometry, layer.part[y, x], layer.primitive[y, x])
-        red, green, blue = channel_iors(exits.ior[lane], np.float64(world.materials.abbe[m]))
-        ior[lane] = red if channel == 0 else (green if channel == 1 else blue)
+        abbe = np.float64(world.materials.abbe[layer.material[y, x]])
+        red, green, blue = channel_iors(exits.ior[lane], abbe)
+        exits.ior_now[lane] = red if channel == _RED else (green if channel == _GREEN else blue)
 
 
 @inlined
-def _query_exits(query, exits, block, parts, world):  # type: ignore[no-untyped-def]
+def _query_exits(scratch: LayerScratch, world: World) -> None:
+    """Ask what the rays see that have come through."""
+    query, exits, block = scratch.query, scratch.exits, scratch.block
     for lane in range(LANES):
         query.on[lane] = exits.on[lane]
         if exits.on[lane] == 0:
             continue
-        for c in range(3):
-            query.origin[lane, c] = exits.point[lane, c]
-            query.direction[lane, c] = exits.direction[lane, c]
-            query.normal[lane, c] = block.ns[lane, c]
+        put(query.origin, lane, row(exits.point, lane))
+        put(query.direction, lane, row(exits.direction, lane))
+        put(query.normal, lane, row(block.ns, lane))
         rough = block.roughness[lane]
-        bent = transmitted_roughness(rough, exits.ior[lane], True)
-        query.blur[lane] = _tan_of_lobe(bent)
+        query.blur[lane] = _tan_of_lobe(transmitted_roughness(rough, exits.ior[lane], True))
         query.roughness[lane] = rough
-        query.thing[lane] = world.geometry.thing[parts[lane]]
+        query.thing[lane] = world.geometry.thing[scratch.parts[lane]]
         query.embedded[lane] = 1 if exits.status[lane] == EMBEDDED else 0
 
 
 @inlined
-def _query_reflections(query, block, parts, world):  # type: ignore[no-untyped-def]
+def _query_reflections(scratch: LayerScratch, world: World) -> None:
+    """Ask what the surfaces mirror."""
+    query, block = scratch.query, scratch.block
     for lane in range(LANES):
         query.on[lane] = block.on[lane]
         query.embedded[lane] = 0
@@ -225,31 +230,31 @@ def _query_reflections(query, block, parts, world):  # type: ignore[no-untyped-d
         r = reflect(scale(wo, -1.0), n)
         if dot(r, ng) <= 0.0:
             r = reflect(scale(wo, -1.0), ng)
-        start = off_surface(row(block.point, lane), ng, r)
-        for c in range(3):
-            query.origin[lane, c] = start[c]
-            query.direction[lane, c] = r[c]
-            query.normal[lane, c] = n[c]
+        put(query.origin, lane, off_surface(row(block.point, lane), ng, r))
+        put(query.direction, lane, r)
+        put(query.normal, lane, n)
         query.blur[lane] = _tan_of_lobe(block.roughness[lane])
         query.roughness[lane] = block.roughness[lane]
-        query.thing[lane] = world.geometry.thing[parts[lane]]
+        query.thing[lane] = world.geometry.thing[scratch.parts[lane]]
 
 
 @inlined
-def _note_transmission(planes, front, sample, query, exits, x0, y0):  # type: ignore[no-untyped-def]
+def _note_transmission(
+    planes: Planes, front: bool, sample: int, query: Query, exits: Exits, x0: int, y0: int
+) -> None:
     """What the exits were and which tiers answered, before the query is used again."""
     for lane in range(LANES):
         if query.on[lane] == 0:
             continue
-        exits.unanswered[lane] = max(0.0, query.weight[lane, 4])
+        exits.unanswered[lane] = max(0.0, query.weight[lane, NONE])
         if not front:
             continue
         x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
         planes.mask[y, x] += 1.0
-        planes.screen[y, x] += query.weight[lane, 0]
-        planes.ray[y, x] += query.weight[lane, 1]
-        planes.probe[y, x] += query.weight[lane, 2]
-        planes.sky[y, x] += query.weight[lane, 3]
+        planes.screen[y, x] += query.weight[lane, SCREEN]
+        planes.ray[y, x] += query.weight[lane, RAY]
+        planes.probe[y, x] += query.weight[lane, PROBE]
+        planes.sky[y, x] += query.weight[lane, SKY]
         planes.none[y, x] += exits.unanswered[lane]
         for c in range(3):
             planes.transmittance[y, x, c] += exits.transmittance[lane, c]
@@ -261,20 +266,23 @@ def _note_transmission(planes, front, sample, query, exits, x0, y0):  # type: ig
 
 
 @inlined
-def _composite(result, planes, front, sample, query, exits, block, through, opacity, z_self, x0, y0):  # type: ignore[no-untyped-def]
+def _composite(
+    result: LayerResult, planes: Planes, front: bool, sample: int, scratch: LayerScratch, x0: int, y0: int
+) -> None:
     """(1 - opacity) of the diffuse gives way to what came through; reflection and highlights stay whole."""
+    block, query, exits = scratch.block, scratch.query, scratch.exits
     for lane in range(LANES):
         if block.on[lane] == 0:
             continue
         x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
-        n, wo = row(block.ns, lane), row(block.wo, lane)
+        n, wo, opacity = row(block.ns, lane), row(block.wo, lane), scratch.opacity[lane]
         f = fresnel_dielectric(min(1.0, max(0.0, dot(n, wo))), 1.0 / exits.ior[lane])
-        clear_share = (1.0 - opacity[lane]) * (1.0 - f)
+        clear_share = (1.0 - opacity) * (1.0 - f)
         for c in range(3):
-            refraction = through[lane, c] * clear_share
+            refraction = scratch.through[lane, c] * clear_share
             reflection = query.color[lane, c] * f + block.specular[lane, c]
             diffuse = block.emissive[lane, c] + block.albedo[lane, c] * block.diffuse[lane, c] / np.pi
-            result.color[y, x, c] = refraction + reflection + opacity[lane] * diffuse
+            result.color[y, x, c] = refraction + reflection + opacity * diffuse
             result.normal[y, x, c] = block.ng[lane, c]
             if front:
                 planes.refraction[y, x, c] += refraction
@@ -282,6 +290,6 @@ def _composite(result, planes, front, sample, query, exits, block, through, opac
                 if sample == 0:
                     planes.normal[y, x, c] = block.ns[lane, c]
         result.alpha[y, x] = 1.0 - exits.unanswered[lane] * clear_share
-        result.depth[y, x] = z_self[lane]
+        result.depth[y, x] = query.z_self[lane]
         if front and sample == 0:
-            planes.z_depth[y, x] = z_self[lane]
+            planes.z_depth[y, x] = query.z_self[lane]

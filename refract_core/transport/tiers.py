@@ -12,27 +12,29 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels.compile import inlined
-from ..kernels.lanes import LANES, Column, Flags, Scalars, Vectors, Words
+from ..kernels.compile import flag, inlined
+from ..kernels.lanes import LANES, Column, Flags, Pairs, Scalars, Vectors, Words
 from ..kernels.sampling import unit_pair
-from ..kernels.vec import add, frame, normalize, row, scale
+from ..kernels.vec import Vec, add, frame, normalize, row, scale
 from ..optics.interface import screen_lod_hdrp
-from ..probes.lookup import influence, probe_light, proxy_distance
+from ..probes.lookup import ProbeTable, influence, probe_light, proxy_distance
 from ..probes.reach import next_of, piece_of
 from ..probes.volumes import update_headroom
+from ..view.pyramid import Screen
 from ..view.screen import screen_march, screen_proxy
-from ..world.embree import OPAQUE, SCATTERED, clear, set_ray
+from ..world.embree import OPAQUE, SCATTERED, Packet, clear, set_ray
 from ..world.environment import prefiltered
-from ..world.shading import load_hits, shade
+from ..world.shading import Block, load_hits, shade
+from ..world.tables import World
 from ..world.tracing import intersect_world
 
 SCREEN, RAY, PROBE, SKY = 0, 1, 2, 3
 """Codes of `settings.TIERS`, in its order."""
-BY_MARCH = np.bool_(False)
+BY_MARCH = flag(False)
 """For `ask`: reflections march also where refraction goes by proxy, as HDRP's own do."""
 NONE = 4
 """Column of the weights for what no tier answered."""
-EMBEDDED_ONLY, ALL_RAYS = np.bool_(True), np.bool_(False)
+EMBEDDED_ONLY, ALL_RAYS = flag(True), flag(False)
 _ROUGH_RAY = 3  # purpose of the sampling sequence
 _SPENT = 1.0 - 1e-6
 
@@ -45,6 +47,10 @@ class Query(NamedTuple):
     """Eight rays that want a colour, and what they got."""
 
     on: Flags
+    pixel: Pairs
+    """x, y of the pixel that asks"""
+    z_self: Scalars
+    """its own z_depth [m]"""
     origin: Vectors
     """[m]"""
     direction: Vectors
@@ -63,8 +69,34 @@ class Query(NamedTuple):
     confidence: Scalars
 
 
+class Asking(NamedTuple):
+    """Who is asked, and in which order: the same for every ray of a picture."""
+
+    order: NDArray[np.int32]
+    """tier codes, first asked first"""
+    by_proxy: bool
+    """refraction asks the screen by HDRP's proxy instead of by march"""
+    screen: Screen
+    probes: ProbeTable
+    thing_probe: NDArray[np.int32]
+    """shape (things,): the probe whose proxy serves each thing, or -1"""
+
+
+class TierScratch(NamedTuple):
+    """What the ray tier draws with: it is overwritten."""
+
+    packet: Packet
+    second: Block
+    """what the rays meet"""
+    third: Block
+    """what its mirrors show"""
+    far: Scalars
+    """T_FAR of the rays"""
+
+
 @inlined
-def _add(query, lane, tier, color, weight, confidence):  # type: ignore[no-untyped-def]
+def _add(query: Query, lane: int, tier: int, color: Vec, weight: float, confidence: float) -> None:
+    """Give a ray a share of its light, and take the share from what is left."""
     for c in range(3):
         query.color[lane, c] += color[c] * weight
     query.weight[lane, tier] += weight
@@ -73,20 +105,17 @@ def _add(query, lane, tier, color, weight, confidence):  # type: ignore[no-untyp
 
 
 @inlined
-def _headroom(query, lane):  # type: ignore[no-untyped-def]
+def _headroom(query: Query, lane: int) -> float:
+    """Weight that no tier has answered yet."""
     return query.weight[lane, NONE]
 
 
 @inlined
-def ask(query, order, hdrp, screen, probes, thing_probe, z_self, block, second, third, packet, world, sample):  # type: ignore[no-untyped-def]
+def ask(query: Query, asking: Asking, by_proxy: bool, work: TierScratch, world: World, sample: int) -> None:
     """Fill colour, weight and confidence of every lane that is on.
 
     Args:
-        order: tier codes, first asked first.
-        hdrp: screen tier by proxy instead of by march, with HDRP's mapping of roughness.
-        thing_probe: shape (things,), the probe whose proxy serves each thing, or -1.
-        z_self: shape (8,), z_depth of the shaded pixels.
-        block: gives the pixels; `second`, `third` and the packet are overwritten.
+        by_proxy: screen tier by proxy instead of by march, with HDRP's mapping of roughness for all tiers.
     """
     inside = False
     for lane in range(LANES):
@@ -97,12 +126,13 @@ def ask(query, order, hdrp, screen, probes, thing_probe, z_self, block, second, 
         query.weight[lane, NONE] = 1.0
         query.confidence[lane] = 0.0
         inside = inside or (query.on[lane] != 0 and query.embedded[lane] != 0)
-    if inside:
-        _ask_rays(query, EMBEDDED_ONLY, block, second, third, packet, world, sample)
+    if inside:  # what lies inside the glass is near, and known to be met: nobody can guess it better than a ray
+        _ask_rays(query, EMBEDDED_ONLY, work, world, sample)
+    order = asking.order
     for i in range(order.shape[0]):
         tier = order[i]
         if tier == RAY:
-            _ask_rays(query, ALL_RAYS, block, second, third, packet, world, sample)
+            _ask_rays(query, ALL_RAYS, work, world, sample)
             continue
         sky_follows = False
         for j in range(i + 1, order.shape[0]):
@@ -111,26 +141,27 @@ def ask(query, order, hdrp, screen, probes, thing_probe, z_self, block, second, 
             if query.on[lane] == 0 or _headroom(query, lane) <= 1.0 - _SPENT:
                 continue
             if tier == SCREEN:
-                _ask_screen(query, lane, hdrp, screen, probes, thing_probe, z_self, block)
+                _ask_screen(query, lane, asking, by_proxy)
             elif tier == PROBE:
-                _ask_probes(query, lane, hdrp, probes, thing_probe, world, sky_follows)
+                _ask_probes(query, lane, asking, by_proxy, world, sky_follows)
             elif tier == SKY and world.environment.present:
-                gloss = query.roughness[lane] if hdrp else math.sqrt(min(1.0, 0.5 * query.blur[lane]))
+                gloss = query.roughness[lane] if by_proxy else math.sqrt(min(1.0, 0.5 * query.blur[lane]))
                 light = prefiltered(world.environment, row(query.direction, lane), gloss)
                 _add(query, lane, SKY, light, _headroom(query, lane), 1.0)
 
 
 @inlined
-def _ask_screen(query, lane, hdrp, screen, probes, thing_probe, z_self, block):  # type: ignore[no-untyped-def]
+def _ask_screen(query: Query, lane: int, asking: Asking, by_proxy: bool) -> None:
+    screen = asking.screen
     origin, direction = row(query.origin, lane), row(query.direction, lane)
-    if hdrp:
-        k = thing_probe[query.thing[lane]]
+    if by_proxy:
+        k = asking.thing_probe[query.thing[lane]]
         if k < 0:
             return
-        distance = proxy_distance(probes, k, origin, direction)
+        distance = proxy_distance(asking.probes, k, origin, direction)
         lod = screen_lod_hdrp(query.roughness[lane], screen.color_level.shape[0])
-        px, py = block.pixel[lane, 0] + 0.5, block.pixel[lane, 1] + 0.5
-        color, w, confidence = screen_proxy(screen, origin, direction, distance, px, py, z_self[lane], lod)
+        px, py = query.pixel[lane, 0] + 0.5, query.pixel[lane, 1] + 0.5
+        color, w, confidence = screen_proxy(screen, origin, direction, distance, px, py, query.z_self[lane], lod)
     else:
         color, w, confidence = screen_march(screen, origin, direction, query.blur[lane])
     _, w = update_headroom(1.0 - _headroom(query, lane), w)
@@ -138,28 +169,31 @@ def _ask_screen(query, lane, hdrp, screen, probes, thing_probe, z_self, block): 
 
 
 @inlined
-def _ask_probes(query, lane, hdrp, probes, thing_probe, world, sky_follows):  # type: ignore[no-untyped-def]
+def _ask_probes(query: Query, lane: int, asking: Asking, by_proxy: bool, world: World, sky_follows: bool) -> None:
     """Every probe that reaches the ray's origin, in order; then the one that is the thing's own."""
+    probes = asking.probes
     p = row(query.origin, lane)
     cuts, sets = probes.reach.cuts, probes.reach.sets
     i, j, l = piece_of(cuts, 0, p[0]), piece_of(cuts, 1, p[1]), piece_of(cuts, 2, p[2])  # noqa: E741
     k = next_of(sets, i, j, l, 0)
     while k >= 0 and _headroom(query, lane) > 1.0 - _SPENT:
-        _ask_probe(query, lane, k, hdrp, probes, world, sky_follows)
+        _ask_probe(query, lane, k, by_proxy, probes, world, sky_follows)
         k = next_of(sets, i, j, l, k + 1)
-    own = thing_probe[query.thing[lane]]
+    own = asking.thing_probe[query.thing[lane]]
     if own >= 0 and probes.owned[own] != 0 and _headroom(query, lane) > 1.0 - _SPENT:
-        _ask_probe(query, lane, own, hdrp, probes, world, sky_follows)
+        _ask_probe(query, lane, own, by_proxy, probes, world, sky_follows)
 
 
 @inlined
-def _ask_probe(query, lane, k, hdrp, probes, world, sky_follows):  # type: ignore[no-untyped-def]
+def _ask_probe(
+    query: Query, lane: int, k: int, by_proxy: bool, probes: ProbeTable, world: World, sky_follows: bool
+) -> None:
     origin, direction, n = row(query.origin, lane), row(query.direction, lane), row(query.normal, lane)
     w = influence(probes, k, origin, n, direction)
     if w <= 0.0:
         return
     light, coverage, fits, confidence = probe_light(
-        probes, k, origin, direction, query.blur[lane], query.roughness[lane], hdrp, world.environment,
+        probes, k, origin, direction, query.blur[lane], query.roughness[lane], by_proxy, world.environment,
         sky_follows and world.environment.present,
     )  # fmt: skip
     # The colour carries its own coverage; only the covered share of the weight is used up.
@@ -173,8 +207,9 @@ def _ask_probe(query, lane, k, hdrp, probes, world, sky_follows):  # type: ignor
 
 
 @inlined
-def _ask_rays(query, embedded, block, second, third, packet, world, sample):  # type: ignore[no-untyped-def]
+def _ask_rays(query: Query, embedded: bool, work: TierScratch, world: World, sample: int) -> None:
     """One ray into the opaque scene for every lane with weight left; `embedded` lanes only, or all."""
+    packet, second = work.packet, work.second
     clear(packet)
     some = False
     for lane in range(LANES):
@@ -184,25 +219,25 @@ def _ask_rays(query, embedded, block, second, third, packet, world, sample):  # 
             continue
         some = True
         d = row(query.direction, lane)
-        x, y = block.pixel[lane, 0], block.pixel[lane, 1]
+        x, y = query.pixel[lane, 0], query.pixel[lane, 1]
         if query.blur[lane] > 0.0:
             u1, u2 = unit_pair(x, y, sample, _ROUGH_RAY)
             d = _scatter(d, query.blur[lane], u1, u2)
         second.pixel[lane, 0], second.pixel[lane, 1] = x + 104729, y
-        third.scratch[0, lane] = math.inf
+        work.far[lane] = math.inf
         set_ray(packet, lane, row(query.origin, lane), d, 0.0, math.inf, OPAQUE)
     if not some:
         return
-    intersect_world(packet, world, third.scratch[0], SCATTERED)
+    intersect_world(packet, world, work.far, SCATTERED)
     load_hits(second, packet, world, 0.0)
-    shade(second, third, packet, world, sample, OPAQUE)
+    shade(second, work.third, packet, world, sample, OPAQUE)
     for lane in range(LANES):
         if second.on[lane] != 0:
             _add(query, lane, RAY, row(second.color, lane), _headroom(query, lane), 1.0)
 
 
 @inlined
-def _scatter(d, blur, u1, u2):  # type: ignore[no-untyped-def]
+def _scatter(d: Vec, blur: float, u1: float, u2: float) -> Vec:
     """A direction of the rough lobe around `d`: GGX slopes of width `blur`, cut at 85 degrees."""
     x, y = frame(d)
     slope = min(11.0, blur * math.sqrt(u1 / max(1e-6, 1.0 - u1)))

@@ -9,31 +9,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels.compile import inlined, kernel
-from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Scalars
-from ..kernels.vec import dot
+from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Flags, Scalars
+from ..kernels.vec import Vec, dot
 from ..scene import Model
 from ..world.embree import (
     COHERENT,
     EVERYTHING,
-    GEOM,
-    HIT_U,
-    HIT_V,
     OPAQUE,
-    PRIM,
     REFRACTIVE,
-    T_FAR,
     Packet,
     clear,
-    keep_valid,
+    has_hit,
+    hit_distance,
+    restart,
     set_ray,
 )
 from ..world.environment import radiance
+from ..world.offsets import past
 from ..world.shading import Block, load_hits, shade
-from ..world.surface import hit_at, material_of
-from ..world.tracing import intersect_world
-from .camera import pixel_ray
+from ..world.surface import NOTHING, Hit, Interaction, Ray, hit_in, interaction
+from ..world.tables import World
+from ..world.tracing import intersect_world, ray_of
+from .camera import View, pixel_ray
 
 _MAX_SKIPS = 64
+"""Inner sides of glass that a view ray may pass before it enters one."""
+
+Tile = tuple[int, int, int, int]
+"""x0, y0, x1, y1 [pixels]; x0 and y0 are multiples of 4"""
 
 
 class ViewScratch(NamedTuple):
@@ -44,6 +47,8 @@ class ViewScratch(NamedTuple):
     second: Block
     far: Scalars
     """T_FAR that each lane started with"""
+    asked: Flags
+    """lanes of the block that are in the picture, while those behind glass are traced again"""
 
 
 class OpaqueLayer(NamedTuple):
@@ -60,61 +65,62 @@ class OpaqueLayer(NamedTuple):
 
 
 class RefractiveLayer(NamedTuple):
-    """The n-th refractive surface that each view ray enters. `part` is -1 where there is none."""
+    """The n-th refractive surface that each view ray enters, as a `surface.Hit`. All planes have shape (H, W)."""
 
     part: NDArray[np.int32]
+    """`NOTHING` where there is none"""
     primitive: NDArray[np.int32]
+    instance: NDArray[np.int32]
+    material: NDArray[np.int32]
     u: NDArray[np.float32]
     v: NDArray[np.float32]
-    distance: NDArray[np.float32]
+    t: NDArray[np.float32]
     """hit distance along the view ray [m]"""
+    inside: NDArray[np.uint8]
+    """1 where the hit is not one that the ray enters by: it starts in glass, or looks at an inner side"""
 
 
 def new_refractive_layer(width: int, height: int) -> RefractiveLayer:
     """A layer with nothing in it."""
-    shape = (height, width)
-    return RefractiveLayer(
-        np.full(shape, -1, np.int32),
-        np.zeros(shape, np.int32),
-        np.zeros(shape, np.float32),
-        np.zeros(shape, np.float32),
-        np.zeros(shape, np.float32),
-    )
+    part, primitive, instance, material = (np.full((height, width), NOTHING, np.int32) for _ in range(4))
+    u, v, t = (np.zeros((height, width), np.float32) for _ in range(3))
+    return RefractiveLayer(part, primitive, instance, material, u, v, t, np.zeros((height, width), np.uint8))
 
 
 @inlined
-def _enters(world, packet, lane):  # type: ignore[no-untyped-def]
-    """The ray in a lane meets a refractive surface from outside: any side of a sheet, the outer side of a solid."""
-    part, primitive = packet.words[GEOM, lane], packet.words[PRIM, lane]
-    m = material_of(world.geometry, part, primitive)
-    if world.geometry.sheet[part] != 0 or world.materials.model[m] == Model.THIN.value:
+def _enters(world: World, hit: Hit, ray: Ray) -> bool:
+    """The ray meets a refractive surface from outside: any side of a sheet, the outer side of a solid."""
+    if world.geometry.sheet[hit.part] != 0 or world.materials.model[hit.material] == Model.THIN.value:
         return True
-    rays = packet.rays
-    origin = (np.float64(rays[0, lane]), np.float64(rays[1, lane]), np.float64(rays[2, lane]))
-    direction = (np.float64(rays[4, lane]), np.float64(rays[5, lane]), np.float64(rays[6, lane]))
-    u, v = np.float64(rays[HIT_U, lane]), np.float64(rays[HIT_V, lane])
-    hit = hit_at(world.geometry, part, primitive, u, v, origin, direction, np.float64(rays[T_FAR, lane]), 0.0)
-    return dot(hit.ng, direction) < 0.0
+    return dot(interaction(world.geometry, hit, ray, 0.0).ng, ray.direction) < 0.0
 
 
 @inlined
-def _is_refractive(world, packet, lane):  # type: ignore[no-untyped-def]
-    m = material_of(world.geometry, packet.words[GEOM, lane], packet.words[PRIM, lane])
-    return world.materials.model[m] != Model.NONE.value
+def _is_refractive(world: World, hit: Hit) -> bool:
+    return world.materials.model[hit.material] != Model.NONE.value
 
 
 @inlined
-def _note(layer, x, y, packet, lane):  # type: ignore[no-untyped-def]
-    layer.part[y, x] = packet.words[GEOM, lane]
-    layer.primitive[y, x] = packet.words[PRIM, lane]
-    layer.u[y, x] = packet.rays[HIT_U, lane]
-    layer.v[y, x] = packet.rays[HIT_V, lane]
-    layer.distance[y, x] = packet.rays[T_FAR, lane]
+def _note(layer: RefractiveLayer, x: int, y: int, hit: Hit, inside: bool) -> None:
+    layer.part[y, x] = hit.part
+    layer.primitive[y, x] = hit.primitive
+    layer.instance[y, x] = hit.instance
+    layer.material[y, x] = hit.material
+    layer.u[y, x] = hit.u
+    layer.v[y, x] = hit.v
+    layer.t[y, x] = hit.t
+    layer.inside[y, x] = 1 if inside else 0
 
 
 @inlined
-def add_view_ray(packet, view, lane, x, y, near, far, mask):  # type: ignore[no-untyped-def]
-    """Put the view ray of a pixel into a lane, from distance `near` (or the near plane) to `far`; keeps no state."""
+def add_view_ray(
+    packet: Packet, view: View, lane: int, x: int, y: int, near: float, far: float, mask: int
+) -> float:
+    """Put the view ray of a pixel into a lane, from distance `near` (or the near plane) to `far` [m].
+
+    Returns:
+        Where it ends: `far`, or the far plane [m].
+    """
     origin, direction, cosine = pixel_ray(view, x + 0.5, y + 0.5)
     start = max(near, view.clipping[0] / cosine)
     stop = min(far, view.clipping[1] / cosine)
@@ -122,17 +128,30 @@ def add_view_ray(packet, view, lane, x, y, near, far, mask):  # type: ignore[no-
     return stop
 
 
+@inlined
+def pixel_spread(view: View) -> float:
+    """Growth of a pixel's cone per metre along its ray; its width at the eye is left out."""
+    return 0.0 if view.orthographic else (view.window[1] - view.window[0]) / view.size[0]
+
+
 @kernel
-def opaque_tile(world, view, scratch, tile, sample, layer, first):  # type: ignore[no-untyped-def]
-    """Fill `layer` (OpaqueLayer) and `first` (RefractiveLayer 0) over a tile (x0, y0, x1, y1), in pixels.
+def opaque_tile(
+    world: World,
+    view: View,
+    scratch: ViewScratch,
+    tile: Tile,
+    sample: int,
+    layer: OpaqueLayer,
+    first: RefractiveLayer,
+) -> tuple[int, int, int]:
+    """Fill `layer` and `first`, the nearest refractive layer, over a tile.
 
     Returns:
         (rays traced, refractive pixels, refractive pixels whose first surface is not one that they enter).
     """
-    packet, block, second, far = scratch.packet, scratch.block, scratch.second, scratch.far
+    packet, block, far = scratch.packet, scratch.block, scratch.far
     packet.tally[0] = 0
     width, height = view.size[0], view.size[1]
-    spread = (view.window[1] - view.window[0]) / width * (0.0 if view.orthographic else 1.0)
     entered = left = 0
     for y0 in range(tile[1], tile[3], BLOCK_HEIGHT):
         for x0 in range(tile[0], tile[2], BLOCK_WIDTH):
@@ -148,41 +167,44 @@ def opaque_tile(world, view, scratch, tile, sample, layer, first):  # type: igno
                 x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
                 if packet.valid[lane] == 0:
                     continue
-                first.part[y, x] = -1
-                if packet.words[GEOM, lane] >= 0 and _is_refractive(world, packet, lane):
+                first.part[y, x] = NOTHING
+                first.inside[y, x] = 0
+                if not has_hit(packet, lane):
+                    continue
+                hit = hit_in(packet, lane, world.geometry)
+                if _is_refractive(world, hit):
                     behind = True
-                    _note(first, x, y, packet, lane)
                     entered += 1
-                    if not _enters(world, packet, lane):
-                        first.part[y, x] = -2
-                        left += 1
+                    inside = not _enters(world, hit, ray_of(packet, lane))
+                    left += 1 if inside else 0
+                    _note(first, x, y, hit, inside)
             if behind:
-                _trace_behind_glass(packet, world, view, x0, y0, far, block, spread)
-            else:
-                load_hits(block, packet, world, spread)
-            shade(block, second, packet, world, sample, OPAQUE)
+                _trace_behind_glass(scratch, world, view, x0, y0)
+            load_hits(block, packet, world, pixel_spread(view))
+            shade(block, scratch.second, packet, world, sample, OPAQUE)
             _write_opaque(layer, block, world, view, x0, y0)
     return packet.tally[0], entered, left
 
 
 @inlined
-def _trace_behind_glass(packet, world, view, x0, y0, far, block, spread):  # type: ignore[no-untyped-def]
+def _trace_behind_glass(scratch: ViewScratch, world: World, view: View, x0: int, y0: int) -> None:
     """Trace again, glass left out, the lanes that met glass first; the others keep the hits they have."""
-    keep_valid(packet, 2)
-    kept = packet.kept[2]
+    packet = scratch.packet
     for lane in range(LANES):
+        scratch.asked[lane] = packet.valid[lane]
+        again = has_hit(packet, lane) and _is_refractive(world, hit_in(packet, lane, world.geometry))
         packet.valid[lane] = 0
-        if kept[lane] != 0 and packet.words[GEOM, lane] >= 0 and _is_refractive(world, packet, lane):
+        if again:
             x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
-            far[lane] = add_view_ray(packet, view, lane, x, y, 0.0, math.inf, OPAQUE)
-    intersect_world(packet, world, far, COHERENT)
+            scratch.far[lane] = add_view_ray(packet, view, lane, x, y, 0.0, math.inf, OPAQUE)
+    intersect_world(packet, world, scratch.far, COHERENT)
     for lane in range(LANES):
-        packet.valid[lane] = kept[lane]
-    load_hits(block, packet, world, spread)
+        packet.valid[lane] = scratch.asked[lane]
 
 
 @inlined
-def _write_opaque(layer, block, world, view, x0, y0):  # type: ignore[no-untyped-def]
+def _write_opaque(layer: OpaqueLayer, block: Block, world: World, view: View, x0: int, y0: int) -> None:
+    """Put the colours of a block into the picture; the sky where nothing was hit."""
     for lane in range(LANES):
         x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
         if x >= view.size[0] or y >= view.size[1]:
@@ -204,12 +226,20 @@ def _write_opaque(layer, block, world, view, x0, y0):  # type: ignore[no-untyped
 
 
 @kernel
-def peel_tile(world, view, scratch, tile, depth, previous, layer, inside):  # type: ignore[no-untyped-def]
+def peel_tile(
+    world: World,
+    view: View,
+    scratch: ViewScratch,
+    tile: Tile,
+    depth: NDArray[np.float32],
+    previous: RefractiveLayer,
+    layer: RefractiveLayer,
+    inside: bool,
+) -> tuple[int, int]:
     """Fill `layer` with the next refractive surface entered behind `previous` and before the opaque `depth`.
 
-    `previous.part` of -2 means that the ray starts inside: it must leave before it can enter.
-    `inside`: go on in those pixels only and leave the others as they are; `layer` is then `previous` itself.
-    Returns (rays traced, pixels found).
+    `inside`: go on only where `previous` is an inner side, and leave the other pixels as they are; `layer` is then
+    `previous` itself. Returns (rays traced, pixels found).
     """
     packet, far = scratch.packet, scratch.far
     packet.tally[0] = 0
@@ -221,37 +251,36 @@ def peel_tile(world, view, scratch, tile, depth, previous, layer, inside):  # ty
                 x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
                 if x >= view.size[0] or y >= view.size[1]:
                     continue
-                if inside and previous.part[y, x] != -2:
+                if inside and previous.inside[y, x] == 0:
                     continue
-                if previous.part[y, x] != -1:
-                    start = previous.distance[y, x] * (1.0 + 1e-5) + 1e-6
+                if previous.part[y, x] != NOTHING:
+                    start = past(previous.t[y, x])
                     _, _, cosine = pixel_ray(view, x + 0.5, y + 0.5)
                     far[lane] = add_view_ray(packet, view, lane, x, y, start, depth[y, x] / cosine, REFRACTIVE)
-                layer.part[y, x] = -1
+                layer.part[y, x] = NOTHING
+                layer.inside[y, x] = 0
             entered += _peel_block(world, packet, far, layer, x0, y0)
     return packet.tally[0], entered
 
 
 @inlined
-def _peel_block(world, packet, far, layer, x0, y0):  # type: ignore[no-untyped-def]
+def _peel_block(world: World, packet: Packet, far: Scalars, layer: RefractiveLayer, x0: int, y0: int) -> int:
+    """Send the rays in the packet on until each enters glass or meets none. Returns how many entered."""
     entered = 0
     for _ in range(_MAX_SKIPS):
         intersect_world(packet, world, far, COHERENT)
         again = False
         for lane in range(LANES):
-            if packet.valid[lane] == 0:
-                continue
+            met = has_hit(packet, lane)
             packet.valid[lane] = 0
-            if packet.words[GEOM, lane] < 0:
+            if not met:
                 continue
-            if _enters(world, packet, lane):
-                _note(layer, x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH, packet, lane)
+            hit = hit_in(packet, lane, world.geometry)
+            if _enters(world, hit, ray_of(packet, lane)):
+                _note(layer, x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH, hit, False)
                 entered += 1
                 continue
-            packet.rays[3, lane] = packet.rays[T_FAR, lane] * (1.0 + 1e-5) + 1e-6
-            packet.rays[T_FAR, lane] = far[lane]
-            packet.words[GEOM, lane] = -1
-            packet.valid[lane] = -1
+            restart(packet, lane, past(hit_distance(packet, lane)), far[lane])
             again = True
         if not again:
             break
@@ -259,15 +288,11 @@ def _peel_block(world, packet, far, layer, x0, y0):  # type: ignore[no-untyped-d
 
 
 @inlined
-def view_point(view, layer, world, x, y):  # type: ignore[no-untyped-def]
-    """(hit, direction, z_depth) of a refractive layer at a pixel."""
+def view_point(view: View, layer: RefractiveLayer, world: World, x: int, y: int) -> tuple[Interaction, Vec, float]:
+    """(interaction, direction of the view ray, z_depth [m]) of a refractive layer at a pixel."""
     origin, direction, cosine = pixel_ray(view, x + 0.5, y + 0.5)
-    t = np.float64(layer.distance[y, x])
-    spread = 0.0 if view.orthographic else (view.window[1] - view.window[0]) / view.size[0]
-    hit = hit_at(
-        world.geometry, layer.part[y, x], layer.primitive[y, x], np.float64(layer.u[y, x]), np.float64(layer.v[y, x]),
-        origin, direction, t, spread,
+    hit = Hit(
+        layer.part[y, x], layer.primitive[y, x], layer.instance[y, x], layer.material[y, x],
+        np.float64(layer.u[y, x]), np.float64(layer.v[y, x]), np.float64(layer.t[y, x]),
     )  # fmt: skip
-    return hit, direction, t * cosine
-
-
+    return interaction(world.geometry, hit, Ray(origin, direction), pixel_spread(view)), direction, hit.t * cosine

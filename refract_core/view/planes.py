@@ -104,7 +104,8 @@ def finish_tile(planes, view, finish, tile):  # type: ignore[no-untyped-def]
             if z < np.inf:
                 p = transform_point(finish.stage_from_engine, pixel_point(view, x + 0.5, y + 0.5, np.float64(z)))
                 normal = planes.normal[y, x]
-                n = transform_direction(finish.stage_rotation, (np.float64(normal[0]), np.float64(normal[1]), np.float64(normal[2])))
+                towards = (np.float64(normal[0]), np.float64(normal[1]), np.float64(normal[2]))
+                n = transform_direction(finish.stage_rotation, towards)
                 for c in range(3):
                     planes.point[y, x, c] = p[c]
                     planes.normal[y, x, c] = n[c]

@@ -2,4 +2,4 @@
 that leaves an opaque hit.
 """
 
-__all__ = ["embree", "environment", "lights", "shading", "surface", "tables", "textures", "tracing"]
+__all__ = ["embree", "environment", "lights", "offsets", "shading", "surface", "tables", "textures", "tracing"]

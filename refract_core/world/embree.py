@@ -20,26 +20,26 @@ from numba import types
 from numpy.typing import NDArray
 
 from ..errors import EmbreeError, SceneError
-from ..kernels.compile import inlined
-from ..kernels.lanes import LANES
+from ..kernels.compile import flag, inlined, word
+from ..kernels.lanes import LANES, Flags, Scalars
+from ..kernels.vec import Vec
 
 # Ray masks: what a ray may see. A geometry carries one of the first five, and one of the rest per captured set.
-# numpy scalars, because numba compiles a function anew for every Python constant it is called with.
-SOLID_STATIC = np.int64(1)
-SOLID_MOVING = np.int64(2)
-CUTOUT_STATIC = np.int64(4)
-CUTOUT_MOVING = np.int64(8)
-REFRACTIVE = np.int64(16)
+SOLID_STATIC = word(1)
+SOLID_MOVING = word(2)
+CUTOUT_STATIC = word(4)
+CUTOUT_MOVING = word(8)
+REFRACTIVE = word(16)
 FIRST_CAPTURED_BIT = 5
 SOLID = SOLID_STATIC | SOLID_MOVING
 CUTOUT = CUTOUT_STATIC | CUTOUT_MOVING
 OPAQUE = SOLID | CUTOUT
 OPAQUE_STATIC = SOLID_STATIC | CUTOUT_STATIC
-EVERYTHING = np.int64(-1)
+EVERYTHING = word(-1)
 
 # Whether the rays of a packet stay together: Embree then culls with their common frustum.
-COHERENT = np.bool_(True)
-SCATTERED = np.bool_(False)
+COHERENT = flag(True)
+SCATTERED = flag(False)
 
 _INVALID = -1  # RTC_INVALID_GEOMETRY_ID as int32
 _COHERENT_FLAG = 1 << 16  # RTC_RAY_QUERY_FLAG_COHERENT
@@ -208,8 +208,12 @@ class Packet(NamedTuple):
     """shape (8,) int32: RTCIntersectArguments"""
     tally: NDArray[np.int64]
     """shape (1,) int64: rays traced so far"""
-    kept: NDArray[np.int32]
-    """shape (3, 8) int32: where callers at three depths keep `valid` while they trace some lanes again"""
+    asked: Flags
+    """`valid` as the caller of `tracing.intersect_world` set it, while it looks behind cut-outs"""
+    shadowed: Flags
+    """`valid` as the caller of `tracing.visible` set it, while it looks behind cut-outs"""
+    ends: Scalars
+    """T_FAR of the segments that `tracing.visible` was asked about"""
 
     @staticmethod
     def fresh() -> Packet:
@@ -226,26 +230,21 @@ class Packet(NamedTuple):
             valid=ints[_WORDS * LANES : (_WORDS + 1) * LANES],
             arguments=arguments,
             tally=np.zeros(1, np.int64),
-            kept=np.zeros((3, LANES), np.int32),
+            asked=np.zeros(LANES, np.int32),
+            shadowed=np.zeros(LANES, np.int32),
+            ends=np.zeros(LANES),
         )
 
 
 @inlined
-def clear(packet):  # type: ignore[no-untyped-def]
+def clear(packet: Packet) -> None:
     """No lane active."""
     for lane in range(LANES):
         packet.valid[lane] = 0
 
 
 @inlined
-def keep_valid(packet, depth):  # type: ignore[no-untyped-def]
-    """Remember which lanes are active, in `packet.kept[depth]`."""
-    for lane in range(LANES):
-        packet.kept[depth, lane] = packet.valid[lane]
-
-
-@inlined
-def set_ray(packet, lane, origin, direction, t_near, t_far, mask):  # type: ignore[no-untyped-def]
+def set_ray(packet: Packet, lane: int, origin: Vec, direction: Vec, t_near: float, t_far: float, mask: int) -> None:
     """Put a ray into a lane and activate it. `direction` need not be unit; distances are in its length."""
     rays, words = packet.rays, packet.words
     rays[ORG_X, lane] = origin[0]
@@ -262,7 +261,49 @@ def set_ray(packet, lane, origin, direction, t_near, t_far, mask):  # type: igno
 
 
 @inlined
-def _active(packet):  # type: ignore[no-untyped-def]
+def restart(packet: Packet, lane: int, t_near: float, t_far: float) -> None:
+    """Send the ray of a lane on its way again, over another stretch of it."""
+    packet.rays[T_NEAR, lane] = t_near
+    packet.rays[T_FAR, lane] = t_far
+    packet.words[GEOM, lane] = _INVALID
+    packet.valid[lane] = -1
+
+
+@inlined
+def ray_origin(packet: Packet, lane: int) -> Vec:
+    """Where the ray of a lane starts, as Embree has it [m]."""
+    rays = packet.rays
+    return (np.float64(rays[ORG_X, lane]), np.float64(rays[ORG_Y, lane]), np.float64(rays[ORG_Z, lane]))
+
+
+@inlined
+def ray_direction(packet: Packet, lane: int) -> Vec:
+    """Where the ray of a lane goes, as Embree has it; of the length it was given."""
+    rays = packet.rays
+    return (np.float64(rays[DIR_X, lane]), np.float64(rays[DIR_Y, lane]), np.float64(rays[DIR_Z, lane]))
+
+
+@inlined
+def has_hit(packet: Packet, lane: int) -> bool:
+    """The ray of a lane was traced by `intersect`, and met something."""
+    return packet.valid[lane] != 0 and packet.words[GEOM, lane] >= 0
+
+
+@inlined
+def hit_distance(packet: Packet, lane: int) -> float:
+    """Distance to the hit of a lane, in lengths of its direction; T_FAR as it was given where there is none."""
+    return np.float64(packet.rays[T_FAR, lane])
+
+
+@inlined
+def is_blocked(packet: Packet, lane: int) -> bool:
+    """The ray of a lane was traced by `occluded`, and something is in its way."""
+    return packet.valid[lane] != 0 and packet.rays[T_FAR, lane] < 0.0
+
+
+@inlined
+def _count_active(packet: Packet) -> int:
+    """How many lanes are going to be traced; the tally grows by as many."""
     n = 0
     for lane in range(LANES):
         n -= packet.valid[lane]
@@ -271,18 +312,18 @@ def _active(packet):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def intersect(packet, scene, coherent):  # type: ignore[no-untyped-def]
+def intersect(packet: Packet, scene: int, coherent: bool) -> None:
     """Nearest hit of every active lane; GEOM is -1 where there is none. T_FAR becomes the hit distance."""
-    if _active(packet) == 0:
+    if _count_active(packet) == 0:
         return
     packet.arguments[0] = _COHERENT_FLAG if coherent else 0
     _rtc_intersect8(packet.valid.ctypes.data, scene, packet.rays.ctypes.data, packet.arguments.ctypes.data)
 
 
 @inlined
-def occluded(packet, scene, coherent):  # type: ignore[no-untyped-def]
+def occluded(packet: Packet, scene: int, coherent: bool) -> None:
     """Any hit of every active lane: T_FAR becomes -inf where something is in the way."""
-    if _active(packet) == 0:
+    if _count_active(packet) == 0:
         return
     packet.arguments[0] = _COHERENT_FLAG if coherent else 0
     _rtc_occluded8(packet.valid.ctypes.data, scene, packet.rays.ctypes.data, packet.arguments.ctypes.data)

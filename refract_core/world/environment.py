@@ -15,7 +15,6 @@ from ..errors import SceneError
 from ..kernels.compile import inlined, kernel
 from ..kernels.vec import Vec, transform_direction
 from ..scene import F32, F64, Environment
-from .inversion import I16, guide_of, pick
 
 MAX_RADIANCE = 1e30
 """Brighter pixels, and infinite ones, are cut to this, so that sums stay finite in float32."""
@@ -30,6 +29,7 @@ LOBE_FOOTPRINT = (4.0, 1.6)
 """Footprint of a GGX lobe [rad] is the first times alpha over 1 + the second times alpha; see `prefiltered`."""
 TEXEL_LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. ITU-R BT.709
 
+I16 = np.ndarray[tuple[int, ...], np.dtype[np.int16]]
 I64 = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
 
@@ -178,6 +178,18 @@ def _distribution(pixels: F32) -> tuple[F64, F32]:
     row_cdf /= row_cdf[-1]
     column_cdf[:, -1] = 1.0
     return row_cdf, column_cdf.astype(np.float32)
+
+
+def guide_of(cdf: F32 | F64) -> I16:
+    """Where the search for a chance begins: shape (G,), an entry for four intervals (Chen and Asau 1974).
+
+    A search by halves in a table that is large and read at random waits for memory at every step; a guide leaves two.
+
+    Args:
+        cdf: shape (N + 1,), N up to 32767: chance before interval i; the last is 1.
+    """
+    count = max((len(cdf) - 1) // 4, 1)
+    return (np.searchsorted(cdf, np.arange(count) / count, side="right") - 1).astype(np.int16)
 
 
 @kernel
@@ -342,6 +354,16 @@ def irradiance(table: EnvironmentTable, n: Vec) -> Vec:
     u, v = _position(table, n)
     height, width = IRRADIANCE_SHAPE
     return _bilinear(table.irradiance_pool, 0, height, width, table.irradiance_poles, u, v)
+
+
+@inlined
+def pick(cdf: F32 | F64, guide: I16, u: float) -> int:
+    """Index i with cdf[i] <= u < cdf[i + 1], of an interval that is not empty, for u in 0 .. 1."""
+    cells, last = guide.shape[0], cdf.shape[0] - 2
+    i = int(guide[min(int(u * cells), cells - 1)])
+    while i < last and cdf[i + 1] <= u:
+        i += 1
+    return i
 
 
 @inlined

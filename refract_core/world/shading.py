@@ -8,103 +8,124 @@ Every room that needs the colour of an opaque hit calls it: the picture, probes,
 from __future__ import annotations
 
 import math
-from typing import Annotated, NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import NamedTuple
 
 from ..kernels.compile import inlined
-from ..kernels.lanes import LANES, Flags, Pairs, Rows, Scalars, Vectors, put
+from ..kernels.lanes import LANES, Flags, Pairs, Scalars, Vectors, put
 from ..kernels.sampling import unit_pair
-from ..kernels.vec import add, dot, flip_towards, frame, lerp, mul, normalize, row, scale, sub
+from ..kernels.vec import Vec, add, dot, flip_towards, frame, lerp, mul, normalize, row, scale, sub
+from ..optics.interface import f0_from_ior
 from ..optics.lobes import MIRROR_ALPHA, sample_half_vector, specular_albedo
 from ..scene import Param
-from .embree import GEOM, HIT_U, HIT_V, PRIM, SCATTERED, T_FAR, clear, set_ray
+from .embree import SCATTERED, Packet, clear, has_hit, ray_direction, set_ray
 from .environment import irradiance, prefiltered, sample_direction
-from .lights import CAMERA_LIGHT, highlight, irradiance_factor, shadow_ray
-from .surface import color_input, float_input, hit_at, material_of, normal_input
-from .tracing import add_shadow_ray, intersect_world, off_surface, visible
+from .lights import CAMERA_LIGHT, LightTable, highlight, irradiance_factor, shadow_ray
+from .offsets import off_surface
+from .surface import Interaction, color_input, float_input, hit_in, interaction, normal_input, share_input
+from .tables import World
+from .tracing import add_shadow_ray, intersect_world, ray_of, visible
 
 _REFLECTED_ROUGHNESS = 0.5
 _POLISHED_ROUGHNESS = 0.2
 """Mirrors up to the first roughness, and dielectrics up to the second, reflect the scene by a ray of their own; others
 take their reflection from the environment map alone."""
+_COAT_F0 = 0.04  # a clear coat of ior 1.5 (UsdPreviewSurface)
 _SKY_CANDIDATES = 2
 # Purposes of the sampling sequence; lights use 16 + their number.
 _SKY, _MIRROR = 1, 2
 
 
 class Block(NamedTuple):
-    """Eight opaque hits and the light they send back."""
+    """Eight opaque hits and the light they send back. A lane holds what its last `load_surface` found."""
 
     on: Flags
     """1 where the lane holds a hit"""
     pixel: Pairs
-    """keys of the sampling sequence"""
+    """x, y: keys of the sampling sequence. Set by whoever asks, before anything is loaded"""
+
+    # The surfaces, from `load_surface` until the lane is loaded again.
     point: Vectors
     """[m]"""
     ng: Vectors
-    """geometric normal, on the viewer's side"""
+    """unit geometric normal, on the viewer's side"""
     ns: Vectors
-    """shading normal, on the side of ng"""
+    """unit shading normal, on the side of ng"""
     wo: Vectors
-    """towards the viewer"""
+    """unit, towards the viewer"""
     albedo: Vectors
-    """diffuse reflectance"""
+    """diffuse reflectance, 0 .. 1"""
     f0: Vectors
+    """reflectance at normal incidence"""
     emissive: Vectors
+    """radiance"""
     roughness: Scalars
+    """perceptual, 0 .. 1"""
     coat: Scalars
+    """share of the clear coat, 0 .. 1"""
     coat_roughness: Scalars
+    """perceptual, 0 .. 1"""
     occlusion: Scalars
+    """share of the sky that the material lets in, 0 .. 1"""
+    distance: Scalars
+    """hit distance [m]; inf where nothing was hit"""
+
+    # The light, from `gather` or `shade` until the next of them.
     diffuse: Vectors
     """irradiance that arrived"""
     specular: Vectors
-    """radiance of the lights' highlights"""
+    """radiance towards wo of the lights' highlights"""
+    sky_seen: Scalars
+    """share of the sky's light that arrives, 0 .. 1"""
     color: Vectors
     """the result: radiance towards wo"""
-    distance: Scalars
-    """hit distance [m]; inf where nothing was hit"""
-    scratch: Annotated[NDArray[np.float64], Rows(4)]
-    """shape (4, 8)"""
+
+    # Within `gather`, for one light.
+    lamp_diffuse: Scalars
+    """irradiance per radiance of the light, if nothing is in the way [sr]"""
+    lamp_specular: Scalars
+    """highlight per radiance of the light, without Fresnel, if nothing is in the way"""
+    lamp_seen: Scalars
+    """1 where nothing is in the way"""
+
+    # Within `shade`, for the mirror bounce.
+    bounced: Flags
+    """1 where a mirror ray was sent"""
+    bounce: Vectors
+    """its unit direction, needed after the packet has been used again"""
+    bounce_end: Scalars
+    """T_FAR of the mirror rays [m]"""
 
 
 @inlined
-def load_hits(block, packet, world, spread):  # type: ignore[no-untyped-def]
-    """Look at every hit of a traced packet and note its surface in the block."""
-    rays, words = packet.rays, packet.words
+def load_hits(block: Block, packet: Packet, world: World, spread: float) -> None:
+    """Look at every hit of a traced packet and note its surface in the block. `spread`: see `surface.interaction`."""
     for lane in range(LANES):
         block.on[lane] = 0
         block.distance[lane] = math.inf
-        if packet.valid[lane] == 0 or words[GEOM, lane] < 0:
+        if not has_hit(packet, lane):
             continue
-        direction = (np.float64(rays[4, lane]), np.float64(rays[5, lane]), np.float64(rays[6, lane]))
-        origin = (np.float64(rays[0, lane]), np.float64(rays[1, lane]), np.float64(rays[2, lane]))
-        t = np.float64(rays[T_FAR, lane])
-        u, v = np.float64(rays[HIT_U, lane]), np.float64(rays[HIT_V, lane])
-        hit = hit_at(world.geometry, words[GEOM, lane], words[PRIM, lane], u, v, origin, direction, t, spread)
+        ray = ray_of(packet, lane)
+        at = interaction(world.geometry, hit_in(packet, lane, world.geometry), ray, spread)
         block.on[lane] = 1
-        block.distance[lane] = t
-        load_surface(block, lane, hit, world, scale(direction, -1.0))
+        block.distance[lane] = at.hit.t
+        load_surface(block, lane, at, world, scale(ray.direction, -1.0))
 
 
 @inlined
-def load_surface(block, lane, hit, world, wo):  # type: ignore[no-untyped-def]
+def load_surface(block: Block, lane: int, at: Interaction, world: World, wo: Vec) -> None:
     """Evaluate a UsdPreviewSurface at a hit (UsdPreviewSurface specification 2.5, shading model)."""
-    g, mt, tx = world.geometry, world.materials, world.textures
-    m = material_of(g, hit.part, hit.primitive)
-    ng = flip_towards(hit.ng, wo)
-    ns = flip_towards(normal_input(g, mt, tx, hit, m), ng)
-    base = color_input(g, mt, tx, hit, m, Param.DIFFUSE.value)
+    ng = flip_towards(at.ng, wo)
+    ns = flip_towards(normal_input(world, at), ng)
+    base = color_input(world, at, Param.DIFFUSE.value)
     metallic = 0.0
-    if mt.specular_workflow[m]:
-        f0 = color_input(g, mt, tx, hit, m, Param.SPECULAR.value)
+    if world.materials.specular_workflow[at.hit.material]:
+        f0 = color_input(world, at, Param.SPECULAR.value)
     else:
-        metallic = min(1.0, max(0.0, float_input(g, mt, tx, hit, m, Param.METALLIC.value)))
-        ior = float_input(g, mt, tx, hit, m, Param.IOR.value)
-        dielectric = ((ior - 1.0) / (ior + 1.0)) ** 2
+        metallic = share_input(world, at, Param.METALLIC.value)
+        dielectric = f0_from_ior(float_input(world, at, Param.IOR.value))
         f0 = lerp((dielectric, dielectric, dielectric), base, metallic)
-    roughness = min(1.0, max(0.0, float_input(g, mt, tx, hit, m, Param.ROUGHNESS.value)))
+    roughness = share_input(world, at, Param.ROUGHNESS.value)
+    # What the surface mirrors does not enter it: the diffuse part gets what the specular lobe leaves over.
     sent_back = specular_albedo(f0, roughness, abs(dot(ns, wo)))
     kept = scale(base, 1.0 - metallic)
     diffuse = (
@@ -112,21 +133,21 @@ def load_surface(block, lane, hit, world, wo):  # type: ignore[no-untyped-def]
         kept[1] * (1.0 - min(1.0, sent_back[1])),
         kept[2] * (1.0 - min(1.0, sent_back[2])),
     )
-    put(block.point, lane, hit.point)
+    put(block.point, lane, at.point)
     put(block.ng, lane, ng)
     put(block.ns, lane, ns)
     put(block.wo, lane, wo)
     put(block.albedo, lane, diffuse)
     put(block.f0, lane, f0)
-    put(block.emissive, lane, color_input(g, mt, tx, hit, m, Param.EMISSIVE.value))
+    put(block.emissive, lane, color_input(world, at, Param.EMISSIVE.value))
     block.roughness[lane] = roughness
-    block.coat[lane] = min(1.0, max(0.0, float_input(g, mt, tx, hit, m, Param.CLEARCOAT.value)))
-    block.coat_roughness[lane] = min(1.0, max(0.0, float_input(g, mt, tx, hit, m, Param.CLEARCOAT_ROUGHNESS.value)))
-    block.occlusion[lane] = min(1.0, max(0.0, float_input(g, mt, tx, hit, m, Param.OCCLUSION.value)))
+    block.coat[lane] = share_input(world, at, Param.CLEARCOAT.value)
+    block.coat_roughness[lane] = share_input(world, at, Param.CLEARCOAT_ROUGHNESS.value)
+    block.occlusion[lane] = share_input(world, at, Param.OCCLUSION.value)
 
 
 @inlined
-def _fresnel(f0, roughness, cosine):  # type: ignore[no-untyped-def]
+def _fresnel(f0: Vec, roughness: float, cosine: float) -> Vec:
     """Schlick with its grazing value lowered for rough surfaces (Lagarde 2011) and for those that hardly reflect."""
     x = (1.0 - min(1.0, cosine)) ** 5
     top = (1.0 - roughness) * min(1.0, 50.0 * max(f0[0], f0[1], f0[2]))
@@ -138,10 +159,9 @@ def _fresnel(f0, roughness, cosine):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _gather_lights(block, packet, world, sample, mask):  # type: ignore[no-untyped-def]
+def _gather_lights(block: Block, packet: Packet, world: World, sample: int, mask: int) -> None:
     """Add every light's irradiance to `diffuse` and its highlights to `specular`, with shadows."""
     lights = world.lights
-    light_d, light_s, seen = block.scratch[0], block.scratch[1], block.scratch[2]
     for lane in range(LANES):
         for c in range(3):
             block.diffuse[lane, c] = 0.0
@@ -149,28 +169,30 @@ def _gather_lights(block, packet, world, sample, mask):  # type: ignore[no-untyp
     for l in range(lights.kind.shape[0]):  # noqa: E741
         clear(packet)
         for lane in range(LANES):
-            light_d[lane] = light_s[lane] = 0.0
-            seen[lane] = 1.0
+            block.lamp_diffuse[lane] = block.lamp_specular[lane] = 0.0
+            block.lamp_seen[lane] = 1.0
             if block.on[lane] == 0:
                 continue
             p, n, wo = row(block.point, lane), row(block.ns, lane), row(block.wo, lane)
-            light_d[lane] = irradiance_factor(lights, l, p, n) * lights.diffuse[l]
+            block.lamp_diffuse[lane] = irradiance_factor(lights, l, p, n) * lights.diffuse[l]
             gloss = block.roughness[lane]
-            light_s[lane] = highlight(lights, l, p, n, wo, gloss * gloss) * lights.specular[l]
-            if light_d[lane] + light_s[lane] > 0.0 and lights.kind[l] != CAMERA_LIGHT:
+            block.lamp_specular[lane] = highlight(lights, l, p, n, wo, gloss * gloss) * lights.specular[l]
+            arrives = block.lamp_diffuse[lane] + block.lamp_specular[lane] > 0.0
+            if arrives and lights.kind[l] != CAMERA_LIGHT:
                 u1, u2 = unit_pair(block.pixel[lane, 0], block.pixel[lane, 1], sample, 16 + l)
                 direction, distance = shadow_ray(lights, l, p, u1, u2)
                 add_shadow_ray(packet, lane, p, row(block.ng, lane), direction, distance)
         if lights.kind[l] != CAMERA_LIGHT:
-            visible(packet, world, mask, seen)
-        _add_light(block, lights, l, light_d, light_s, seen)
+            visible(packet, world, mask, block.lamp_seen)
+        _add_light(block, lights, l)
 
 
 @inlined
-def _add_light(block, lights, l, light_d, light_s, seen):  # type: ignore[no-untyped-def] # noqa: E741
+def _add_light(block: Block, lights: LightTable, l: int) -> None:  # noqa: E741
+    """Add one light, whose share of each hit is known, to the sums."""
     radiance = row(lights.radiance, l)
     for lane in range(LANES):
-        if block.on[lane] == 0 or seen[lane] == 0.0:
+        if block.on[lane] == 0 or block.lamp_seen[lane] == 0.0:
             continue
         n, wo, p = row(block.ns, lane), row(block.wo, lane), row(block.point, lane)
         f = _fresnel(row(block.f0, lane), block.roughness[lane], max(0.0, dot(n, wo)))
@@ -178,20 +200,20 @@ def _add_light(block, lights, l, light_d, light_s, seen):  # type: ignore[no-unt
         coat_light = 0.0
         if coat > 0.0:
             gloss = block.coat_roughness[lane]
-            fc = coat * (0.04 + 0.96 * (1.0 - min(1.0, max(0.0, dot(n, wo)))) ** 5)
+            fc = coat * (_COAT_F0 + (1.0 - _COAT_F0) * (1.0 - min(1.0, max(0.0, dot(n, wo)))) ** 5)
             coat_light = fc * highlight(lights, l, p, n, wo, gloss * gloss) * lights.specular[l]
         for c in range(3):
-            block.diffuse[lane, c] += radiance[c] * light_d[lane]
-            block.specular[lane, c] += radiance[c] * (light_s[lane] * f[c] + coat_light)
+            block.diffuse[lane, c] += radiance[c] * block.lamp_diffuse[lane]
+            block.specular[lane, c] += radiance[c] * (block.lamp_specular[lane] * f[c] + coat_light)
 
 
 @inlined
-def _gather_sky(block, packet, world, sample, mask):  # type: ignore[no-untyped-def]
+def _gather_sky(block: Block, packet: Packet, world: World, sample: int, mask: int) -> None:
     """Add the environment's irradiance to `diffuse`. Its unoccluded value is exact; how much of it arrives is asked
     along one direction, chosen among candidates in proportion to what it would bring (resampled importance sampling,
-    Talbot et al. 2005). The same answer is left in scratch row 3 for the environment's highlight."""
+    Talbot et al. 2005). The same answer dims the sky's highlight (`_add_gloss_of_sky`)."""
     environment = world.environment
-    seen = block.scratch[3]
+    seen = block.sky_seen
     for lane in range(LANES):
         seen[lane] = 1.0
     if not environment.present:
@@ -233,7 +255,7 @@ def _gather_sky(block, packet, world, sample, mask):  # type: ignore[no-untyped-
 
 
 @inlined
-def _cosine_direction(n, u1, u2):  # type: ignore[no-untyped-def]
+def _cosine_direction(n: Vec, u1: float, u2: float) -> Vec:
     x, y = frame(n)
     r = math.sqrt(u1)
     phi = 2.0 * math.pi * u2
@@ -242,78 +264,91 @@ def _cosine_direction(n, u1, u2):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def gather(block, packet, world, sample, mask):  # type: ignore[no-untyped-def]
-    """What arrives at every hit: irradiance into `diffuse`, the lights' highlights into `specular`."""
+def gather(block: Block, packet: Packet, world: World, sample: int, mask: int) -> None:
+    """What arrives at every hit: irradiance into `diffuse`, the lights' highlights into `specular`.
+
+    `mask`: what casts shadows. The packet is overwritten.
+    """
     _gather_lights(block, packet, world, sample, mask)
     _gather_sky(block, packet, world, sample, mask)
 
 
 @inlined
-def _shade_without_bounce(block, packet, world, sample, mask):  # type: ignore[no-untyped-def]
+def _shade_without_bounce(block: Block, packet: Packet, world: World, sample: int, mask: int) -> None:
     """Emission, lights and environment of every hit in the block."""
     gather(block, packet, world, sample, mask)
     for lane in range(LANES):
         if block.on[lane] == 0:
             continue
+        # A Lambertian surface spreads what arrives evenly: radiance is irradiance times albedo over pi.
         lit = scale(mul(row(block.albedo, lane), row(block.diffuse, lane)), 1.0 / math.pi)
         put(block.color, lane, add(add(row(block.emissive, lane), lit), row(block.specular, lane)))
 
 
 @inlined
-def _environment_gloss(block, lane, world, f0, roughness, weight):  # type: ignore[no-untyped-def]
+def _add_gloss_of_sky(block: Block, lane: int, world: World, f0: Vec, roughness: float, weight: float) -> None:
     """Add the environment's mirror lobe, dimmed by the visibility found for its diffuse light."""
-    if not world.environment.present or block.scratch[3, lane] == 0.0:
+    if not world.environment.present or block.sky_seen[lane] == 0.0:
         return
     n, wo = row(block.ns, lane), row(block.wo, lane)
     cosine = min(1.0, max(1e-3, dot(n, wo)))
     r = sub(scale(n, 2.0 * dot(n, wo)), wo)
-    light = scale(prefiltered(world.environment, r, roughness), weight * block.scratch[3, lane])
+    light = scale(prefiltered(world.environment, r, roughness), weight * block.sky_seen[lane])
     put(block.color, lane, add(row(block.color, lane), mul(light, specular_albedo(f0, roughness, cosine))))
 
 
 @inlined
-def shade(block, second, packet, world, sample, mask):  # type: ignore[no-untyped-def]
-    """Radiance of every hit in `block` into `block.color`. `second` is another block, used for the mirror bounce.
+def _reflects_the_scene(f0: Vec, roughness: float) -> bool:
+    """The surface is smooth and strong enough for a mirror ray of its own."""
+    strength = max(f0[0], f0[1], f0[2])
+    limit = _REFLECTED_ROUGHNESS if strength > 0.2 else _POLISHED_ROUGHNESS
+    return roughness < limit and strength > 0.02
+
+
+@inlined
+def shade(block: Block, second: Block, packet: Packet, world: World, sample: int, mask: int) -> None:
+    """Radiance of every hit in `block` into `block.color`. `second` is another block, for what the mirrors show.
 
     `mask`: what reflections and shadows may meet. The packet is overwritten.
     """
     _shade_without_bounce(block, packet, world, sample, mask)
     clear(packet)
-    bounces = False
+    some = False
     for lane in range(LANES):
+        block.bounced[lane] = 0
+        block.bounce_end[lane] = math.inf
         if block.on[lane] == 0:
             continue
         f0, roughness = row(block.f0, lane), block.roughness[lane]
-        strength = max(f0[0], f0[1], f0[2])
-        limit = _REFLECTED_ROUGHNESS if strength > 0.2 else _POLISHED_ROUGHNESS
-        if roughness < limit and strength > 0.02:
-            bounces = True
+        if _reflects_the_scene(f0, roughness):
+            some = True
             _add_mirror_ray(block, lane, packet, sample, mask)
         else:
-            _environment_gloss(block, lane, world, f0, roughness, 1.0)
+            _add_gloss_of_sky(block, lane, world, f0, roughness, 1.0)
         if block.coat[lane] > 0.0:
-            _environment_gloss(block, lane, world, (0.04, 0.04, 0.04), block.coat_roughness[lane], block.coat[lane])
-    if not bounces:
-        return
-    far = block.scratch[0]
+            _add_gloss_of_sky(block, lane, world, (_COAT_F0, _COAT_F0, _COAT_F0), block.coat_roughness[lane],
+                              block.coat[lane])  # fmt: skip
+    if some:
+        _add_mirrored(block, second, packet, world, sample, mask)
+
+
+@inlined
+def _add_mirrored(block: Block, second: Block, packet: Packet, world: World, sample: int, mask: int) -> None:
+    """Trace the mirror rays in the packet, and add what they see. It is lit, but mirrors nothing itself any more."""
     for lane in range(LANES):
-        far[lane] = math.inf
         second.pixel[lane, 0] = block.pixel[lane, 0] + 7919
         second.pixel[lane, 1] = block.pixel[lane, 1]
-        # Where the mirror ray of a lane goes is needed after the packet has been reused.
-        block.scratch[1, lane] = packet.valid[lane]
-        put(block.specular, lane, (packet.rays[4, lane], packet.rays[5, lane], packet.rays[6, lane]))
-    intersect_world(packet, world, far, SCATTERED)
+    intersect_world(packet, world, block.bounce_end, SCATTERED)
     load_hits(second, packet, world, 0.0)
     _shade_without_bounce(second, packet, world, sample, mask)
     for lane in range(LANES):
-        if block.scratch[1, lane] == 0.0:
+        if block.bounced[lane] == 0:
             continue
         if second.on[lane] != 0:
-            _environment_gloss(second, lane, world, row(second.f0, lane), second.roughness[lane], 1.0)
+            _add_gloss_of_sky(second, lane, world, row(second.f0, lane), second.roughness[lane], 1.0)
             light = row(second.color, lane)
         elif world.environment.present:
-            light = prefiltered(world.environment, row(block.specular, lane), 0.0)
+            light = prefiltered(world.environment, row(block.bounce, lane), 0.0)
         else:
             continue
         cosine = min(1.0, max(1e-3, dot(row(block.ns, lane), row(block.wo, lane))))
@@ -322,7 +357,8 @@ def shade(block, second, packet, world, sample, mask):  # type: ignore[no-untype
 
 
 @inlined
-def _add_mirror_ray(block, lane, packet, sample, mask):  # type: ignore[no-untyped-def]
+def _add_mirror_ray(block: Block, lane: int, packet: Packet, sample: int, mask: int) -> None:
+    """Put the mirror ray of a hit into the packet: about one microfacet of its lobe where it is not quite smooth."""
     n, wo = row(block.ns, lane), row(block.wo, lane)
     alpha = block.roughness[lane] ** 2
     h = n
@@ -332,6 +368,8 @@ def _add_mirror_ray(block, lane, packet, sample, mask):  # type: ignore[no-untyp
     r = normalize(sub(scale(h, 2.0 * dot(h, wo)), wo))
     ng = row(block.ng, lane)
     below = dot(r, ng)
-    if below < 0.0:
+    if below < 0.0:  # a shading normal may send it into its own surface; there it is thrown back once more
         r = normalize(sub(r, scale(ng, 2.0 * below)))
     set_ray(packet, lane, off_surface(row(block.point, lane), ng, r), r, 0.0, math.inf, mask)
+    block.bounced[lane] = 1
+    put(block.bounce, lane, ray_direction(packet, lane))

@@ -2,36 +2,114 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from ..kernels.compile import inlined
-from ..kernels.vec import add, along, cross, dot, flip_towards, length, normalize, row, scale, sub
+from ..kernels.lanes import Scalars, Words
+from ..kernels.vec import Vec, add, along, cross, dot, flip_towards, length, normalize, row, scale, sub
 from ..scene import Channel, Param
-from .textures import sample
+from .embree import GEOM, HIT_U, HIT_V, INST, PRIM, Packet, hit_distance
+from .tables import Geometry, World
+from .textures import Rgba, sample
+
+NOTHING = -1
+"""`part` of a hit that is none."""
+
+
+class Ray(NamedTuple):
+    """A half line in engine world. `direction` is a unit vector."""
+
+    origin: Vec
+    """[m]"""
+    direction: Vec
 
 
 class Hit(NamedTuple):
-    """Where a ray met a surface."""
+    """Where a ray met a surface: all that Embree tells, and the material, looked up once. Outlives the packet."""
 
     part: int
+    """Embree geometry; `NOTHING` where nothing was met"""
     primitive: int
+    """triangle within the part"""
+    instance: int
+    """Embree instance; -1 for what is not instanced"""
+    material: int
     u: float
+    """barycentric weight of the triangle's second corner"""
     v: float
-    point: tuple[float, float, float]
+    """of its third"""
+    t: float
+    """hit distance [m]"""
+
+
+class HitLanes(NamedTuple):
+    """Eight hits that outlive their packet."""
+
+    part: Words
+    primitive: Words
+    instance: Words
+    material: Words
+    u: Scalars
+    v: Scalars
+    t: Scalars
+
+
+class Interaction(NamedTuple):
+    """A hit looked at: where it is, and which way the surface faces."""
+
+    hit: Hit
+    point: Vec
     """[m]"""
-    ng: tuple[float, float, float]
+    ng: Vec
     """unit geometric normal, outward"""
-    ns: tuple[float, float, float]
+    ns: Vec
     """unit shading normal, on the side of ng"""
     footprint: float
     """width of the ray's cone on the surface [m]"""
 
 
+# --- hits ---------------------------------------------------------------------------------------------------------
+
 
 @inlined
-def _corners(geometry, t):  # type: ignore[no-untyped-def]
+def hit_in(packet: Packet, lane: int, geometry: Geometry) -> Hit:
+    """The hit in a lane of a traced packet; the lane must have one (`embree.has_hit`)."""
+    rays, words = packet.rays, packet.words
+    part, primitive = words[GEOM, lane], words[PRIM, lane]
+    return Hit(
+        part,
+        primitive,
+        words[INST, lane],
+        geometry.material[geometry.first[part] + primitive],
+        np.float64(rays[HIT_U, lane]),
+        np.float64(rays[HIT_V, lane]),
+        hit_distance(packet, lane),
+    )
+
+
+@inlined
+def keep_hit(hits: HitLanes, lane: int, hit: Hit) -> None:
+    """Note a hit in a lane."""
+    hits.part[lane], hits.primitive[lane], hits.instance[lane] = hit.part, hit.primitive, hit.instance
+    hits.material[lane] = hit.material
+    hits.u[lane], hits.v[lane], hits.t[lane] = hit.u, hit.v, hit.t
+
+
+@inlined
+def kept_hit(hits: HitLanes, lane: int) -> Hit:
+    """The hit noted in a lane."""
+    return Hit(
+        hits.part[lane], hits.primitive[lane], hits.instance[lane], hits.material[lane],
+        hits.u[lane], hits.v[lane], hits.t[lane],
+    )  # fmt: skip
+
+
+@inlined
+def _corners(geometry: Geometry, part: int, primitive: int) -> tuple[Vec, Vec, Vec]:
+    t = geometry.first[part] + primitive
     a = row(geometry.points, geometry.triangles[t, 0])
     b = row(geometry.points, geometry.triangles[t, 1])
     c = row(geometry.points, geometry.triangles[t, 2])
@@ -39,15 +117,20 @@ def _corners(geometry, t):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def hit_at(geometry, part, primitive, u, v, origin, direction, distance, spread):  # type: ignore[no-untyped-def]
-    """Point and normals of a hit. `spread`: growth of the ray's cone per metre, for texture filtering."""
+def interaction(geometry: Geometry, hit: Hit, ray: Ray, spread: float) -> Interaction:
+    """Point and normals of a hit. `spread`: growth of the ray's cone per metre, for texture filtering.
+
+    The point of a triangle is taken from its corners, not from the ray: that is exact to the rounding of the corners,
+    where origin plus distance is only as good as the distance.
+    """
+    part, u, v = hit.part, hit.u, hit.v
     if geometry.sphere[part, 3] > 0.0:
         centre = row(geometry.sphere, part)
-        ng = normalize(sub(along(origin, direction, distance), centre))
+        ng = normalize(sub(along(ray.origin, ray.direction, hit.t), centre))
         point = along(centre, ng, np.float64(geometry.sphere[part, 3]))
         ns = ng
     else:
-        a, b, c = _corners(geometry, geometry.first[part] + primitive)
+        a, b, c = _corners(geometry, part, hit.primitive)
         ab, ac = sub(b, a), sub(c, a)
         ng = normalize(cross(ab, ac))
         point = (
@@ -58,7 +141,7 @@ def hit_at(geometry, part, primitive, u, v, origin, direction, distance, spread)
         ns = ng
         k = geometry.first_normal[part]
         if k >= 0:
-            n = geometry.normals[k + primitive]
+            n = geometry.normals[k + hit.primitive]
             w = 1.0 - u - v
             ns = normalize(
                 (
@@ -70,11 +153,14 @@ def hit_at(geometry, part, primitive, u, v, origin, direction, distance, spread)
             if dot(ns, ns) == 0.0:
                 ns = ng
             ns = flip_towards(ns, ng)
-    return Hit(part, primitive, u, v, point, ng, ns, spread * distance)
+    return Interaction(hit, point, ng, ns, spread * hit.t)
+
+
+# --- primvars -----------------------------------------------------------------------------------------------------
 
 
 @inlined
-def primvar2(geometry, hit, slot):  # type: ignore[no-untyped-def]
+def _primvar2(geometry: Geometry, hit: Hit, slot: int) -> tuple[bool, float, float]:
     """(found, s, t) of a float2 primvar at a hit."""
     first = geometry.primvar_first[hit.part, slot]
     if first < 0 or geometry.primvar_size[hit.part, slot] < 2:
@@ -92,8 +178,8 @@ def primvar2(geometry, hit, slot):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _primvar4(geometry, hit, slot):  # type: ignore[no-untyped-def]
-    """(found, r, g, b, a) of any primvar: scalars repeat, a missing alpha is 1."""
+def _primvar4(geometry: Geometry, hit: Hit, slot: int) -> tuple[bool, Rgba]:
+    """(found, (r, g, b, a)) of any primvar: scalars repeat, a missing alpha is 1."""
     first = geometry.primvar_first[hit.part, slot]
     if first < 0:
         return False, (0.0, 0.0, 0.0, 1.0)
@@ -117,12 +203,12 @@ def _primvar4(geometry, hit, slot):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _uv_density(geometry, hit, slot):  # type: ignore[no-untyped-def]
+def _uv_density(geometry: Geometry, hit: Hit, slot: int) -> float:
     """Texture lengths per metre on the hit triangle: the square root of the ratio of areas."""
     stride = geometry.primvar_stride[hit.part, slot]
     if stride == 0 or geometry.sphere[hit.part, 3] > 0.0:
         return 0.0
-    a, b, c = _corners(geometry, geometry.first[hit.part] + hit.primitive)
+    a, b, c = _corners(geometry, hit.part, hit.primitive)
     area = length(cross(sub(b, a), sub(c, a)))
     k = geometry.primvar_first[hit.part, slot] + hit.primitive * stride
     size = geometry.primvar_size[hit.part, slot]
@@ -131,25 +217,31 @@ def _uv_density(geometry, hit, slot):  # type: ignore[no-untyped-def]
     s1, t1 = p[k + size] - s0, p[k + size + 1] - t0
     s2, t2 = p[k + 2 * size] - s0, p[k + 2 * size + 1] - t0
     uv_area = abs(s1 * t2 - s2 * t1)
-    return np.sqrt(uv_area / area) if area > 0.0 else 0.0
+    return math.sqrt(uv_area / area) if area > 0.0 else 0.0
+
+
+# --- material inputs ----------------------------------------------------------------------------------------------
 
 
 @inlined
-def _textured(geometry, materials, textures, hit, m, i):  # type: ignore[no-untyped-def]
+def _textured(world: World, at: Interaction, i: int) -> Rgba:
+    """The texture of input `i`, before its scale and bias; a channel other than RGB repeats in all four."""
+    materials, m = world.materials, at.hit.material
     slot = materials.uv_slot[m, i]
-    s, t = np.float64(materials.uv_value[m, i, 0]), np.float64(materials.uv_value[m, i, 1])
+    s: float = np.float64(materials.uv_value[m, i, 0])
+    t: float = np.float64(materials.uv_value[m, i, 1])
     footprint = 0.0
     if slot >= 0:
-        found, x, y = primvar2(geometry, hit, slot)
+        found, x, y = _primvar2(world.geometry, at.hit, slot)
         if found:
             s, t = x, y
-            footprint = hit.footprint * _uv_density(geometry, hit, slot)
+            footprint = at.footprint * _uv_density(world.geometry, at.hit, slot)
     matrix = materials.uv_matrix[m, i]
     x = matrix[0] * s + matrix[1] * t + matrix[2]
     y = matrix[3] * s + matrix[4] * t + matrix[5]
-    grow = np.sqrt(abs(matrix[0] * matrix[4] - matrix[1] * matrix[3]))
+    grow = math.sqrt(abs(matrix[0] * matrix[4] - matrix[1] * matrix[3]))
     wrap = materials.wrap[m, i]
-    r, g, b, a = sample(textures, materials.texture[m, i], x, y, footprint * grow, wrap[0], wrap[1])
+    r, g, b, a = sample(world.textures, materials.texture[m, i], x, y, footprint * grow, wrap[0], wrap[1])
     channel = materials.channel[m, i]
     if channel == Channel.R.value:
         return (r, r, r, r)
@@ -163,20 +255,23 @@ def _textured(geometry, materials, textures, hit, m, i):  # type: ignore[no-unty
 
 
 @inlined
-def color_input(geometry, materials, textures, hit, m, i):  # type: ignore[no-untyped-def]
-    """Value of input `i` of material `m` at a hit, as three floats."""
+def color_input(world: World, at: Interaction, i: int) -> Vec:
+    """Value of input `i` (a `Param`) of the hit's material there, as three floats."""
+    materials, m = world.materials, at.hit.material
     if (materials.driven[m] >> i) & 1 == 0:
-        return (np.float64(materials.value[m, i, 0]), np.float64(materials.value[m, i, 1]), np.float64(materials.value[m, i, 2]))
-    return _driven_color(geometry, materials, textures, hit, m, i)
+        value = materials.value[m, i]
+        return (np.float64(value[0]), np.float64(value[1]), np.float64(value[2]))
+    return _driven_color(world, at, i)
 
 
 @inlined
-def _driven_color(geometry, materials, textures, hit, m, i):  # type: ignore[no-untyped-def]
+def _driven_color(world: World, at: Interaction, i: int) -> Vec:
+    materials, m = world.materials, at.hit.material
     value = materials.value[m, i]
     if materials.texture[m, i] >= 0:
-        c = _textured(geometry, materials, textures, hit, m, i)
+        c = _textured(world, at, i)
     elif materials.primvar_slot[m, i] >= 0:
-        found, c = _primvar4(geometry, hit, materials.primvar_slot[m, i])
+        found, c = _primvar4(world.geometry, at.hit, materials.primvar_slot[m, i])
         if not found:
             return (np.float64(value[0]), np.float64(value[1]), np.float64(value[2]))
     else:
@@ -186,41 +281,50 @@ def _driven_color(geometry, materials, textures, hit, m, i):  # type: ignore[no-
 
 
 @inlined
-def float_input(geometry, materials, textures, hit, m, i):  # type: ignore[no-untyped-def]
-    """Value of a scalar input `i` of material `m` at a hit."""
+def float_input(world: World, at: Interaction, i: int) -> float:
+    """Value of a scalar input `i` (a `Param`) of the hit's material there."""
+    materials, m = world.materials, at.hit.material
     if (materials.driven[m] >> i) & 1 == 0:
         return np.float64(materials.value[m, i, 0])
-    return _driven_float(geometry, materials, textures, hit, m, i)
+    return _driven_float(world, at, i)
 
 
 @inlined
-def _driven_float(geometry, materials, textures, hit, m, i):  # type: ignore[no-untyped-def]
+def share_input(world: World, at: Interaction, i: int) -> float:
+    """A scalar input that is a share, brought into 0 .. 1: textures and primvars may hold anything."""
+    return min(1.0, max(0.0, float_input(world, at, i)))
+
+
+@inlined
+def _driven_float(world: World, at: Interaction, i: int) -> float:
+    materials, m = world.materials, at.hit.material
     channel = materials.channel[m, i]
     if materials.texture[m, i] >= 0 and channel == Channel.A.value:
-        c = _textured(geometry, materials, textures, hit, m, i)
+        c = _textured(world, at, i)
         return c[3] * materials.scale[m, i, 3] + materials.bias[m, i, 3]
     if materials.texture[m, i] >= 0 and channel < Channel.A.value:
-        c = _textured(geometry, materials, textures, hit, m, i)
+        c = _textured(world, at, i)
         return c[0] * materials.scale[m, i, channel] + materials.bias[m, i, channel]
-    return _driven_color(geometry, materials, textures, hit, m, i)[0]
+    return _driven_color(world, at, i)[0]
 
 
 @inlined
-def material_of(geometry, part, primitive):  # type: ignore[no-untyped-def]
-    return geometry.material[geometry.first[part] + primitive]
+def normal_input(world: World, at: Interaction) -> Vec:
+    """Shading normal with the material's normal map on it, on the side of ng.
 
-
-@inlined
-def normal_input(geometry, materials, textures, hit, m):  # type: ignore[no-untyped-def]
-    """Shading normal with the material's normal map on it, on the side of ng."""
+    The tangent follows the triangle's uv (its direction of growing s), made square to the shading normal; the
+    bitangent's sign is that of the uv area, so that mirrored uv keep the map's handedness.
+    """
+    geometry, materials, hit = world.geometry, world.materials, at.hit
     i = Param.NORMAL.value
+    m = hit.material
     slot = materials.uv_slot[m, i]
     if materials.texture[m, i] < 0 or slot < 0 or geometry.sphere[hit.part, 3] > 0.0:
-        return hit.ns
+        return at.ns
     stride = geometry.primvar_stride[hit.part, slot]
     if geometry.primvar_first[hit.part, slot] < 0 or stride == 0:
-        return hit.ns
-    a, b, c = _corners(geometry, geometry.first[hit.part] + hit.primitive)
+        return at.ns
+    a, b, c = _corners(geometry, hit.part, hit.primitive)
     k = geometry.primvar_first[hit.part, slot] + hit.primitive * stride
     size = geometry.primvar_size[hit.part, slot]
     p = geometry.primvars
@@ -228,12 +332,12 @@ def normal_input(geometry, materials, textures, hit, m):  # type: ignore[no-unty
     s2, t2 = p[k + 2 * size] - p[k], p[k + 2 * size + 1] - p[k + 1]
     area = s1 * t2 - s2 * t1
     if area == 0.0:
-        return hit.ns
+        return at.ns
     tangent = scale(sub(scale(sub(b, a), t2), scale(sub(c, a), t1)), 1.0 / area)
-    tangent = normalize(sub(tangent, scale(hit.ns, dot(hit.ns, tangent))))
-    bitangent = scale(cross(hit.ns, tangent), 1.0 if area > 0.0 else -1.0)
-    n = color_input(geometry, materials, textures, hit, m, i)
-    mapped = add(add(scale(tangent, n[0]), scale(bitangent, n[1])), scale(hit.ns, n[2]))
+    tangent = normalize(sub(tangent, scale(at.ns, dot(at.ns, tangent))))
+    bitangent = scale(cross(at.ns, tangent), 1.0 if area > 0.0 else -1.0)
+    n = color_input(world, at, i)
+    mapped = add(add(scale(tangent, n[0]), scale(bitangent, n[1])), scale(at.ns, n[2]))
     if dot(mapped, mapped) == 0.0:
-        return hit.ns
-    return flip_towards(normalize(mapped), hit.ng)
+        return at.ns
+    return flip_towards(normalize(mapped), at.ng)

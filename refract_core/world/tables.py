@@ -12,6 +12,9 @@ from ..errors import SceneError
 from ..scene import Material, Mesh, Param, Scene, Source, Sphere
 from . import embree
 from .embree import CUTOUT_MOVING, CUTOUT_STATIC, FIRST_CAPTURED_BIT, REFRACTIVE, SOLID_MOVING, SOLID_STATIC, Bvh, Part
+from .environment import EnvironmentTable
+from .lights import LightTable
+from .textures import TextureTable
 
 INPUTS = len(Param)
 
@@ -75,6 +78,29 @@ class MaterialTable(NamedTuple):
     cutout: NDArray[np.uint8]
     absorption_distance: NDArray[np.float32]
     abbe: NDArray[np.float32]
+
+
+class World(NamedTuple):
+    """The whole scene as a kernel sees it."""
+
+    geometry: Geometry
+    materials: MaterialTable
+    textures: TextureTable
+    lights: LightTable
+    environment: EnvironmentTable
+    cutouts: bool
+    """Some material is a cut-out, so that hits must be looked at."""
+
+
+def world_of(
+    geometry: Geometry,
+    materials: MaterialTable,
+    textures: TextureTable,
+    lights: LightTable,
+    environment: EnvironmentTable,
+) -> World:
+    """Put the tables together."""
+    return World(geometry, materials, textures, lights, environment, bool(materials.cutout.any()))
 
 
 def pack_materials(materials: Sequence[Material], slots: dict[str, int]) -> MaterialTable:
