@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,14 @@ from starlette.types import ASGIApp
 
 ROOT = Path(__file__).parents[1]
 SMALL: dict[str, Any] = {"image_width": 32, "samples": 1}
+LONG: dict[str, Any] = {"stage": "marble.usda", "image_width": 1920, "samples": 64}
+"""Minutes of work: still under way whatever a test did meanwhile. For servers with `PATIENT`."""
+PATIENT = ("--limit", "job_seconds=3600", "--limit", "cpu_seconds=3600", "--limit", "pixel_samples=200000000")
+"""Words for a server whose limits of time are not what is tested: jobs take long where others want the cores too."""
+PATIENCE = 180.0
+"""[s] Longest wait for what has to happen. Who waits for a condition loses nothing by it; only a failure comes late."""
+WARM_UP = 900.0
+"""[s] The same for a first worker, who may have to compile the kernels."""
 
 BALL = """#usda 1.0
 (
@@ -61,7 +69,7 @@ class Server:
     log: Path
 
     def client(self, **options: Any) -> httpx.Client:
-        return httpx.Client(base_url=self.url, timeout=60.0, trust_env=False, **options)
+        return httpx.Client(base_url=self.url, timeout=PATIENCE, trust_env=False, **options)
 
     @property
     def address(self) -> tuple[str, int]:
@@ -69,7 +77,7 @@ class Server:
         return host, int(port)
 
     def connect(self) -> socket.socket:
-        return socket.create_connection(self.address, timeout=20.0)
+        return socket.create_connection(self.address, timeout=PATIENCE)
 
     def metric(self, name: str) -> float:
         """Sum of one metric over its labels."""
@@ -92,11 +100,30 @@ class Server:
 
 
 def children(pid: int) -> list[int]:
-    text = Path(f"/proc/{pid}/task/{pid}/children").read_text()
+    """Processes that the first thread of a process started, and that are still there; none where it has ended."""
+    try:
+        text = Path(f"/proc/{pid}/task/{pid}/children").read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return []
     return [int(word) for word in text.split()]
 
 
-def until(true: Any, seconds: float = 60.0) -> None:
+def runs(pid: int) -> bool:
+    """Whether a process runs. One that has ended and that nobody has asked for its exit code does not."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return state not in "XZ"
+
+
+def kill(pid: int) -> None:
+    """Kill a process, which may have ended by itself."""
+    with suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGKILL)
+
+
+def until(true: Any, seconds: float = PATIENCE) -> None:
     """Wait for something to become true."""
     end = time.monotonic() + seconds
     while not true():
@@ -124,13 +151,13 @@ def running(
         assert found, log.read_text()
         server = Server(found.group(), process, data, log)
         with server.client() as client:
-            until(lambda: client.get("/readyz").status_code == 200, 240.0)
+            until(lambda: client.get("/readyz").status_code == 200, WARM_UP)
         yield server
     finally:
         if process.poll() is None:
             process.send_signal(signal.SIGTERM)
         try:
-            process.wait(30)
+            process.wait(PATIENCE)
         finally:
             process.kill()
             process.stdout.close()

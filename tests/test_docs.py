@@ -189,14 +189,14 @@ def test_a_block_that_asks_the_service_runs(block: Block, desk: Path, server: Se
     script = "\n".join(
         [
             "set -euo pipefail",
-            'curl() { command curl --no-progress-meter --fail-with-body --max-time 100 "$@"; }',
+            'curl() { command curl --no-progress-meter --fail-with-body --max-time 600 "$@"; }',
             f'refract() {{ {shlex.quote(sys.executable)} -m refract_core.cli "$@"; }}',
             f'python() {{ {shlex.quote(sys.executable)} "$@"; }}',
             *typed,
         ]
     ).replace("localhost:8000", f"{host}:{port}")
     variables = {**os.environ, "PYTHONPATH": str(ROOT), "no_proxy": "*"}
-    done = subprocess.run(["bash", "-c", script], cwd=desk, env=variables, capture_output=True, timeout=240)
+    done = subprocess.run(["bash", "-c", script], cwd=desk, env=variables, capture_output=True, timeout=1800)
     assert done.returncode == 0, f"{block.text}\n{(done.stdout + done.stderr).decode('utf-8', 'replace')}"
     for file in re.findall(r"-o (\S+\.(?:png|exr|usdz))", block.text):
         assert (desk / file).stat().st_size > 500, file

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +64,8 @@ def DomeLight "Sky"
 }
 """
 SMALL = {"image_width": 32, "samples": 1, "jobs": 1}
+PATIENCE = 300.0
+"""[s] Longest wait for what has to happen, on a machine whose cores are busy with other things."""
 
 
 @dataclass
@@ -218,27 +219,32 @@ def client(cluster: Any) -> Iterator[Any]:
     """To look at the cluster from outside."""
     distributed = pytest.importorskip("distributed")
     with distributed.Client(cluster, set_as_default=False) as found:
-        found.wait_for_workers(2, timeout=60)
+        found.wait_for_workers(2, timeout=PATIENCE)
         yield found
 
 
-def kill_a_busy_worker(client: Any, killed: list[str]) -> None:
-    """Once, the worker that has the most to do."""
-    if not killed:
-        keys, worker = max((len(keys), worker) for worker, keys in client.processing().items())
-        assert keys > 0
-        (pid,) = client.run(os.getpid, workers=[worker]).values()
-        os.kill(pid, signal.SIGKILL)
-        killed.append(worker)
+class Doomed:
+    """A worker that takes work and does not do it: it stands still from now on, and dies when it is told to."""
+
+    def __init__(self, client: Any) -> None:
+        self.client, self.killed_with = client, 0
+        self.worker, self.pid = sorted(client.run(os.getpid).items())[0]
+        os.kill(self.pid, signal.SIGSTOP)
+
+    def die(self) -> None:
+        """Once. Notes with how many pieces of work."""
+        if not self.killed_with:
+            self.killed_with = len(self.client.processing()[self.worker])
+            os.kill(self.pid, signal.SIGKILL)
 
 
 def test_frames_are_those_rendered_here_though_a_worker_dies(stage: Path, crew: Crew, client: Any) -> None:
     here, there = Heard(), Heard()
     render_files(order_of(stage, "here"), here.report(), never)
-    killed: list[str] = []
-    there.on_done = partial(kill_a_busy_worker, client, killed)
+    doomed = Doomed(client)
+    there.on_done = doomed.die
     render_files(order_of(stage, "there"), there.report(), never, crew)
-    assert len(killed) == 1
+    assert doomed.killed_with > 0
     assert sorted(there.done) == [str(stage.parent / "there" / f"p.{k}.exr") for k in range(1, 9)]
     expected = files_in(stage.parent / "here")
     assert len(set(expected.values())) == 8, "the frames must differ, or mixing them up would not be seen"
@@ -263,7 +269,7 @@ def test_a_stage_that_workers_cannot_see_goes_there_once(stage: Path, crew: Crew
         render_files(order_of(stage, "there", frames="1:6"), there.report(), never, crew)
     finally:
         counts = client.run(hide, False)
-    assert set(counts.values()) == {1}
+    assert max(counts.values()) == 1  # one of them may have had no frame to draw
     assert files_in(stage.parent / "there") == files_in(stage.parent / "here")
     assert sorted(there.done) == sorted(path.replace("here", "there") for path in here.done)
 
@@ -294,7 +300,7 @@ def until_cancelled(bench: Bench, folder: str) -> None:
 
 
 def appears(path: Path) -> bool:
-    end = time.monotonic() + 60
+    end = time.monotonic() + PATIENCE
     while not path.exists() and time.monotonic() < end:
         time.sleep(0.02)
     return path.exists()

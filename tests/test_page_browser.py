@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 import shutil
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from subprocess import PIPE, Popen
 from typing import Any
@@ -18,6 +19,11 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 if CHROMIUM is None:
     pytest.skip("Chromium is not installed", allow_module_level=True)
 
+PATIENCE = 60_000
+"""[ms] Longest wait for what has to happen, on a machine whose cores are busy with other things."""
+playwright.expect.set_options(timeout=PATIENCE)
+NEVER = 3600.0
+"""[s] A render that takes as long shows 0 % of progress in every test."""
 MIDDLE = "id => [...document.getElementById(id).getContext('2d').getImageData(32, 18, 1, 1).data]"
 CONTROLS = r"^\s*- (button|textbox|combobox|slider|spinbutton|checkbox|radio|progressbar)\b(?! \")"
 
@@ -40,7 +46,7 @@ def service() -> Iterator[FakeService]:
 def page(browser: Any, service: FakeService) -> Iterator[Any]:
     """A fresh page at the service; an uncaught error or a breach of the content policy fails the test."""
     context = browser.new_context(viewport={"width": 1200, "height": 900})
-    context.set_default_timeout(10_000)
+    context.set_default_timeout(PATIENCE)
     opened = context.new_page()
     wrong: list[str] = []
     opened.on("pageerror", lambda error: wrong.append(str(error)))
@@ -53,6 +59,14 @@ def page(browser: Any, service: FakeService) -> Iterator[Any]:
 
 def status(page: Any, text: str) -> None:
     playwright.expect(page.locator("#status")).to_have_text(text)
+
+
+def until(page: Any, true: Callable[[], bool]) -> None:
+    """Wait for what the service is told beside what the page waits for."""
+    end = time.monotonic() + PATIENCE / 1000
+    while not true():
+        assert time.monotonic() < end, "waited too long"
+        page.wait_for_timeout(20)
 
 
 def pick(page: Any, name: str = "ball.usda") -> None:
@@ -94,7 +108,7 @@ def test_a_file_can_be_dropped_anywhere(page: Any, service: FakeService) -> None
 
 
 def test_progress_is_told_and_cancel_ends_the_job(page: Any, service: FakeService) -> None:
-    service.seconds = 60.0
+    service.seconds = NEVER
     page.get_by_label("Or a sample").select_option("ball.usda")
     status(page, "Rendering, 0 %.")
     assert page.get_by_role("progressbar").is_visible()
@@ -102,24 +116,20 @@ def test_progress_is_told_and_cancel_ends_the_job(page: Any, service: FakeServic
     status(page, "Cancelled.")
     assert page.evaluate("document.activeElement.id") == "render"
     (job,) = service.jobs.values()
-    for _ in range(100):
-        if job.cancelled:
-            break
-        page.wait_for_timeout(20)
-    assert job.cancelled
+    until(page, lambda: job.cancelled)
     service.seconds = 0.1
     page.get_by_role("button", name="Render", exact=True).click()
     status(page, "Done.")
 
 
 def test_a_changed_mind_leaves_no_job_behind(page: Any, service: FakeService) -> None:
-    service.seconds = 60.0
+    service.seconds = NEVER
     page.get_by_label("Or a sample").select_option("ball.usda")
     status(page, "Rendering, 0 %.")
     service.seconds = 0.1
     page.get_by_label("Camera", exact=True).select_option("/World/Far")
     status(page, "Done.")
-    assert [job.cancelled for job in service.jobs.values()] == [True, False]
+    until(page, lambda: [job.cancelled for job in service.jobs.values()] == [True, False])
 
 
 def test_a_refusal_names_the_field_and_leads_to_it(page: Any) -> None:
@@ -144,7 +154,7 @@ def test_a_failed_job_shows_its_problem_and_keeps_the_last_picture(page: Any) ->
     alert = page.get_by_role("alert")
     for part in ("The renderer crashed", "Too deep.", "Prim: /World/Ball"):
         playwright.expect(alert).to_contain_text(part)
-    assert page.locator("#canvas-a.old").is_visible()
+    playwright.expect(page.locator("#canvas-a.old")).to_be_visible()
 
 
 def test_a_stage_that_cannot_be_opened_is_said_to_be_so(page: Any) -> None:
@@ -177,9 +187,10 @@ def test_a_picture_with_notices_says_so(page: Any) -> None:
 def test_two_settings_and_one_slider(page: Any, service: FakeService) -> None:
     pick(page)
     page.get_by_label("Ready-made comparison").select_option("model")
+    status(page, "A done; B done.")
     page.wait_for_selector("#canvas-b:visible")
-    models = [body.get("model") for body in service.asked("POST", "/v1/render")]
-    assert models == [None, "sphere", "traced"]
+    first, *both = [body.get("model") for body in service.asked("POST", "/v1/render")]
+    assert (first, set(both), len(both)) == (None, {"sphere", "traced"}, 2)  # which of the two comes first, nobody says
     slider = page.get_by_label("Compare: A to the left")
     slider.press("ArrowLeft")
     assert slider.get_attribute("aria-valuetext") == "A on the left 49 %, B on the right 51 %"
@@ -229,16 +240,18 @@ def test_a_link_opens_the_same_view(page: Any, service: FakeService) -> None:
     page.get_by_role("group", name="Ball").get_by_label("Absorption colour").check()
     page.locator("#glass-0-transmittanceColor").fill("#ff0000")
     page.get_by_label("Ready-made comparison").select_option("screen")
-    page.wait_for_selector("#canvas-b:visible")
+    status(page, "A done; B done.")
+    before = set(service.jobs)
     page.get_by_role("button", name="Copy link").click()
     link = page.get_by_label(re.compile("^Link")).input_value()
     other = page.context.new_page()
     other.goto(link)
-    other.wait_for_selector("#canvas-b:visible")
+    status(other, "A done; B done.")
+    playwright.expect(other.locator("#canvas-b")).to_be_visible()
     assert other.locator("#sample").input_value() == "room.usda"
     assert other.locator("#glass-0-transmittanceColor").input_value() == "#ff0000"
     assert asked(service)["overrides"] == {"/World/Looks/Ball": {"transmittanceColor": [1, 0, 0]}}
-    assert len(service.jobs) == 3  # the link's two renders are those that were there: same request, same job
+    assert set(service.jobs) == before  # the link's two renders are those that were there: same request, same job
 
 
 def test_commands_are_copied(page: Any) -> None:
@@ -312,14 +325,14 @@ def real_url(tmp_path: Path) -> Iterator[str]:
         said = next(line for line in process.stdout if "http://" in line)
         yield said[said.index("http://") :].strip()
         process.terminate()
-        process.wait(60)
+        process.wait(PATIENCE / 1000)
 
 
 def test_against_the_real_service(browser: Any, real_url: str) -> None:
     opened = browser.new_page()
-    opened.set_default_timeout(30_000)
+    opened.set_default_timeout(PATIENCE)
     opened.goto(f'{real_url}#stage=marble.usda&a={{"image_width":64,"samples":1}}')
-    done = lambda: playwright.expect(opened.locator("#status")).to_have_text("Done.", timeout=400_000)  # noqa: E731
+    done = lambda: playwright.expect(opened.locator("#status")).to_have_text("Done.", timeout=900_000)  # noqa: E731
     done()  # the first worker may have to compile its kernels
     opened.wait_for_selector("#canvas-a:visible")
     assert opened.evaluate("document.getElementById('canvas-a').width") == 64

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,20 +12,20 @@ import httpx
 import numpy as np
 import pytest
 from pxr import Usd
-from service_server import BALL, ROOT, SMALL, Server, running, until, upload
+from service_server import BALL, LONG, PATIENT, ROOT, SMALL, Server, kill, running, until, upload
 
 from refract_core.images.pictures import read_texture
 
 GOOD = ROOT / "usd_samples" / "good"
 JSON = b"POST /v1/render HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
-SLOW = {"stage": "marble.usda", "image_width": 640, "samples": 16}
-"""Seconds of work, to have time to do something meanwhile."""
+SOON = 30.0
+"""[s] What ends within it ended because it was stopped: `LONG` takes longer by itself."""
 
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     data = tmp_path_factory.mktemp("service") / "data"
-    with running(data, "--stage-root", str(GOOD), "--workers", "1", "--queue", "1") as server:
+    with running(data, "--stage-root", str(GOOD), "--workers", "1", "--queue", "1", *PATIENT) as server:
         yield server
 
 
@@ -146,14 +144,14 @@ def test_convert_gives_a_package_without_paths_of_ours(client: httpx.Client, tmp
 
 
 def test_cancel_kills_the_process(client: httpx.Client, server: Server) -> None:
-    job = client.post("/v1/render", json=SLOW, headers={"Prefer": "respond-async"})
+    job = client.post("/v1/render", json=LONG, headers={"Prefer": "respond-async"})
     where = job.headers["location"]
     until(lambda: client.get(where).json()["fraction"] > 0.0)
     before = server.workers()
     cancelled = client.delete(where).json()
     assert cancelled["status"] == "cancelled"
     assert cancelled["problem"]["type"] == "/problems/cancelled"
-    until(lambda: not set(before) & set(server.workers()), 5.0)
+    until(lambda: not set(before) & set(server.workers()), SOON)
     assert client.get(f"{where}/image").status_code == 409
     with client.stream("GET", f"{where}/events") as stream:
         assert next(stream.iter_lines()) == "event: cancelled"
@@ -162,16 +160,16 @@ def test_cancel_kills_the_process(client: httpx.Client, server: Server) -> None:
 
 def test_who_leaves_cancels_what_only_they_waited_for(client: httpx.Client, server: Server) -> None:
     with server.connect() as connection:
-        body = json.dumps({**SLOW, "exposure": 0.5}).encode()
+        body = json.dumps({**LONG, "exposure": 0.5}).encode()
         head = "POST /v1/render HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
         connection.sendall(f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body)
         until(lambda: server.metric("refract_jobs_running") == 1.0)
-    until(lambda: server.metric("refract_jobs_running") == 0.0, 5.0)
+    until(lambda: server.metric("refract_jobs_running") == 0.0, SOON)
 
 
 def test_a_full_queue_refuses_before_it_reads(client: httpx.Client, server: Server) -> None:
     jobs = [
-        client.post("/v1/render", json={**SLOW, "exposure": float(stop)}, headers={"Prefer": "respond-async"})
+        client.post("/v1/render", json={**LONG, "exposure": float(stop)}, headers={"Prefer": "respond-async"})
         for stop in (3, 4)
     ]
     assert [job.status_code for job in jobs] == [202, 202]
@@ -187,11 +185,11 @@ def test_a_full_queue_refuses_before_it_reads(client: httpx.Client, server: Serv
 
 
 def test_the_kill_of_a_worker_fails_one_job(client: httpx.Client, server: Server) -> None:
-    job = client.post("/v1/render", json={**SLOW, "exposure": 0.75}, headers={"Prefer": "respond-async"})
+    job = client.post("/v1/render", json={**LONG, "exposure": 0.75}, headers={"Prefer": "respond-async"})
     where = job.headers["location"]
     until(lambda: client.get(where).json()["fraction"] > 0.0)
     for pid in server.workers():
-        os.kill(pid, signal.SIGKILL)
+        kill(pid)
     until(lambda: client.get(where).json()["status"] == "failed")
     assert client.get(where).json()["problem"]["type"] == "/problems/stage-crashed"
     assert where.rpartition("/")[2] in server.log.read_text()
@@ -199,7 +197,7 @@ def test_the_kill_of_a_worker_fails_one_job(client: httpx.Client, server: Server
 
 
 def test_the_death_of_all_workers_is_survived(client: httpx.Client, server: Server) -> None:
-    os.kill(server.nursery(), signal.SIGKILL)
+    kill(server.nursery())
     first = post(client, exposure=-1.0)
     if first.status_code != 200:  # it had begun
         assert (first.status_code, first.json()["type"]) == (503, "/problems/interrupted")
@@ -286,7 +284,7 @@ def test_an_idle_service_leaves_nothing_behind(client: httpx.Client, server: Ser
     server.idle()
     until(lambda: len(list((server.data / "work").iterdir())) == 1)  # of the next worker
     until(lambda: len(server.workers()) == 1)
-    assert [path for path in server.data.rglob("stage.usd*")] == []
+    until(lambda: not list(server.data.rglob("stage.usd*")))
 
 
 def test_a_browser_asks_anew_for_the_pages_files(client: httpx.Client) -> None:

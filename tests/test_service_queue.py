@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from service_server import BALL, ROOT, running, upload
+from service_server import BALL, LONG, PATIENCE, PATIENT, ROOT, WARM_UP, running, upload
 
 from service.jobs import Jobs
 from service.limits import Limits
@@ -34,11 +34,12 @@ def test_a_nursery_that_cannot_start_tries_again_and_says_why(
         monkeypatch.setattr(sys, "executable", str(tmp_path / "no_python"))
         nursery = Nursery()
         nursery.start()
-        while not caplog.records:
-            await asyncio.sleep(0.01)
+        async with asyncio.timeout(PATIENCE):
+            while not caplog.records:
+                await asyncio.sleep(0.01)
         assert not nursery.ready.is_set()
         monkeypatch.setattr(sys, "executable", good)
-        async with asyncio.timeout(240.0):
+        async with asyncio.timeout(WARM_UP):
             await nursery.ready.wait()
         assert nursery.report["threads"] == 1
         await nursery.stop()
@@ -70,8 +71,17 @@ def test_a_temporary_folder_goes_with_the_service(tmp_path: Path) -> None:
         assert answer.status_code == 200
         assert list(tmp_path.glob("refract-service-*"))
         server.process.send_signal(signal.SIGTERM)
-        server.process.wait(30)
+        server.process.wait(PATIENCE)
     assert not list(tmp_path.glob("refract-service-*"))
+
+
+def test_a_job_that_takes_too_long_is_stopped(tmp_path: Path) -> None:
+    """By the clock; `test_service_hostile` has those that are stopped by the processor time they take."""
+    words = ("--stage-root", str(ROOT / "usd_samples" / "good"), *PATIENT, "--limit", "job_seconds=1")
+    with running(tmp_path / "data", *words) as server, server.client() as client:
+        problem = client.post("/v1/render", json=LONG).json()
+    assert problem["type"] == "/problems/time-limit"
+    assert "stopped after 1 s" in problem["detail"]
 
 
 def test_results_count_their_warnings(tmp_path: Path) -> None:

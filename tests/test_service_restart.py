@@ -4,50 +4,50 @@ from __future__ import annotations
 
 import os
 import signal
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from service_server import BALL, ROOT, SMALL, Server, running, until, upload
+from service_server import BALL, LONG, PATIENCE, PATIENT, ROOT, SMALL, Server, running, runs, until, upload
 
 GOOD = ROOT / "usd_samples" / "good"
-SLOW = {"stage": "marble.usda", "image_width": 640, "samples": 16}
-WORDS = ("--stage-root", str(GOOD), "--workers", "1")
+SECONDS = {"stage": "marble.usda", "image_width": 640, "samples": 16}
+"""Some seconds of work: under way when the service is told to stop, and done in the time that is left for it."""
+WORDS = ("--stage-root", str(GOOD), "--workers", "1", *PATIENT, "--limit", f"drain_seconds={PATIENCE:.0f}")
 
 
 def test_results_survive_a_restart_and_orphans_have_failed(tmp_path: Path) -> None:
     data = tmp_path / "data"
     with running(data, *WORDS) as server, server.client() as client:
         picture = client.post("/v1/render", json={"stage": "traced.usda", **SMALL})
-        orphan = client.post("/v1/render", json=SLOW, headers={"Prefer": "respond-async"}).headers["location"]
+        orphan = client.post("/v1/render", json=LONG, headers={"Prefer": "respond-async"}).headers["location"]
         until(lambda: client.get(orphan).json()["status"] == "running")
         family = [server.nursery(), *server.workers()]
         os.kill(server.process.pid, signal.SIGKILL)
         server.process.wait()
-        until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in family), 10.0)
+        until(lambda: not any(map(runs, family)))
     with running(data, *WORDS) as server, server.client() as client:
         where = picture.headers["content-location"]
         assert client.get(f"{where}/image").content == picture.content
         job = client.get(orphan).json()
         assert (job["status"], job["problem"]["type"]) == ("failed", "/problems/interrupted")
         # a stop lets what runs finish
-        accepted = client.post("/v1/render", json={**SLOW, "samples": 4}, headers={"Prefer": "respond-async"})
-        until(lambda: client.get(accepted.headers["location"]).json()["status"] == "running")
+        accepted = client.post("/v1/render", json=SECONDS, headers={"Prefer": "respond-async"})
+        until(lambda: client.get(accepted.headers["location"]).json()["status"] != "queued")
         server.process.send_signal(signal.SIGTERM)
-        assert server.process.wait(30) in (0, -signal.SIGTERM)
+        assert server.process.wait(2 * PATIENCE) in (0, -signal.SIGTERM)
     record = data / accepted.headers["location"].replace("/v1/jobs", "jobs").lstrip("/") / "record.json"
     assert '"status": "done"' in record.read_text()
 
 
 @pytest.fixture(scope="module")
 def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """A server that asks for a token, and has little patience."""
+    """A server that asks for a token, and has little patience: as much as an honest client needs on a busy machine."""
     folder = tmp_path_factory.mktemp("guarded")
     (folder / "tokens").write_text("# for the tests\ncorrect-horse\nbattery-staple\n")
-    words = ("--workers", "1", "--token-file", str(folder / "tokens"), "--limit", "body_seconds=1",
+    words = ("--workers", "1", "--token-file", str(folder / "tokens"), "--limit", "body_seconds=3",
              "--limit", "body_bytes=100000")  # fmt: skip
-    with running(folder / "data", *words, environment={"REFRACT_LIMIT_HEADER_SECONDS": "1"}) as server:
+    with running(folder / "data", *words, environment={"REFRACT_LIMIT_HEADER_SECONDS": "3"}) as server:
         yield server
 
 
@@ -64,12 +64,10 @@ def test_tokens(guarded: Server) -> None:
             assert client.get("/v1/limits", headers={"Authorization": f"Bearer {token}"}).status_code == 200
 
 
-def talk(server: Server, *parts: bytes, pause: float = 0.0) -> str:
+def talk(server: Server, sent: bytes) -> str:
     """Send raw bytes, and read until the server closes."""
     with server.connect() as connection:
-        for part in parts:
-            connection.sendall(part)
-            time.sleep(pause)
+        connection.sendall(sent)
         said = b""
         while data := connection.recv(65536):
             said += data
@@ -80,9 +78,7 @@ HEAD = b"POST /v1/render HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer correct-ho
 
 
 def test_a_head_without_an_end_is_cut_off(guarded: Server) -> None:
-    start = time.monotonic()
     assert talk(guarded, b"GET /livez HTTP/1.1\r\nHost: x\r\nX-Slow: ") == ""
-    assert time.monotonic() - start < 15.0
 
 
 def test_a_body_that_does_not_come_is_408(guarded: Server) -> None:
@@ -119,4 +115,4 @@ def test_who_leaves_in_the_middle_of_a_body_takes_no_place(guarded: Server) -> N
             assert answer.status_code in (200, 429)
             return answer.status_code == 200
 
-        until(taken, 20.0)
+        until(taken)

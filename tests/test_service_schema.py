@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
-from service_server import BALL, ROOT, SMALL, Server, running, upload
+from service_server import BALL, PATIENCE, PATIENT, ROOT, SMALL, Server, running, upload
 
 schemathesis = pytest.importorskip("schemathesis")
 
@@ -55,7 +55,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     folder = tmp_path_factory.mktemp("schema")
     (folder / "tokens").write_text(TOKEN)
     words = ("--stage-root", str(GOOD), "--workers", "1", "--limit", "pixels=2048", "--limit", "samples=2",
-             "--limit", "job_seconds=20", "--token-file", str(folder / "tokens"))  # fmt: skip
+             *PATIENT, "--token-file", str(folder / "tokens"))  # fmt: skip
     with running(folder / "data", *words) as server:
         yield server
 
@@ -104,7 +104,7 @@ def explored(server: Server) -> Seen:
     )
     schema.config.checks = options.ChecksConfig(**CHECKS)
     schema.config.continue_on_failure = True
-    schema.config.request_timeout = 30
+    schema.config.request_timeout = PATIENCE
     seen = Seen()
     for event in from_schema(schema).execute():
         if isinstance(event, events.NonFatalError | events.FatalError):
