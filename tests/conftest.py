@@ -5,10 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 import schemas
 
 schemas.register()
+# What Hypothesis thinks slow says more about the machine than about the code.
+settings.register_profile("unhurried", parent=settings(), deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("unhurried")
 
 _ASSETS = Path(__file__).parents[2] / "shared" / "assets"
 

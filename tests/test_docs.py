@@ -135,6 +135,7 @@ def asks_the_service(block: Block) -> bool:
     return re.search(r"\bcurl ", block.text) is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("block", [block for block in blocks("sh") if not asks_the_service(block)], ids=name)
 def test_a_shell_block_runs(block: Block, desk: Path) -> None:
     """`refract` commands run as they stand, pictures small and quick."""
@@ -179,6 +180,7 @@ def _output(*command: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("block", [block for block in blocks("sh") if asks_the_service(block)], ids=name)
 def test_a_block_that_asks_the_service_runs(block: Block, desk: Path, server: Server, package: Path) -> None:
     """As bash runs it, with the server on another port; an answer of 400 or more fails."""

@@ -238,6 +238,7 @@ class Doomed:
             os.kill(self.pid, signal.SIGKILL)
 
 
+@pytest.mark.slow
 def test_frames_are_those_rendered_here_though_a_worker_dies(stage: Path, crew: Crew, client: Any) -> None:
     here, there = Heard(), Heard()
     render_files(order_of(stage, "here"), here.report(), never)
@@ -261,6 +262,7 @@ def hide(hidden: bool, dask_worker: Any) -> int:
     return len(list(Path(dask_worker.local_directory).glob("refract-stage-*")))
 
 
+@pytest.mark.slow
 def test_a_stage_that_workers_cannot_see_goes_there_once(stage: Path, crew: Crew, client: Any) -> None:
     here, there = Heard(), Heard()
     render_files(order_of(stage, "here", frames="1:6"), here.report(), never)
@@ -274,6 +276,7 @@ def test_a_stage_that_workers_cannot_see_goes_there_once(stage: Path, crew: Crew
     assert sorted(there.done) == sorted(path.replace("here", "there") for path in here.done)
 
 
+@pytest.mark.slow
 def test_errors_of_a_frame_are_those_it_has_here(stage: Path, crew: Crew) -> None:
     texts = []
     for place in (None, crew):
@@ -284,6 +287,7 @@ def test_errors_of_a_frame_are_those_it_has_here(stage: Path, crew: Crew) -> Non
     assert files_in(stage.parent / "x") == {}
 
 
+@pytest.mark.slow
 def test_cancel_keeps_what_is_done_and_nothing_follows(stage: Path, crew: Crew) -> None:
     heard = Heard()
     with pytest.raises(Cancelled):
@@ -306,6 +310,7 @@ def appears(path: Path) -> bool:
     return path.exists()
 
 
+@pytest.mark.slow
 def test_cancel_reaches_work_that_runs(stage: Path, crew: Crew) -> None:
     def stop() -> None:
         if (stage.parent / "started").exists():
@@ -326,6 +331,7 @@ def bake(stage: Path, folder: str, crew: Crew | None) -> tuple[dict[str, bytes],
     return {"out": out.read_bytes(), **files_in(out.with_suffix(".probes"))}, heard.done
 
 
+@pytest.mark.slow
 def test_probes_are_those_baked_here(tmp_path: Path, crew: Crew) -> None:
     probes = tmp_path / "probes.usda"
     probes.write_text(
@@ -340,6 +346,7 @@ def test_probes_are_those_baked_here(tmp_path: Path, crew: Crew) -> None:
     assert again == here
 
 
+@pytest.mark.slow
 def test_the_commands_take_the_address(stage: Path, cluster: Any) -> None:
     address = cluster.scheduler_address.replace("tcp://", "dask://")
     flags = ["--image-width", "32", "--samples", "1", "--executor", address]

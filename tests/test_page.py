@@ -304,6 +304,7 @@ def chunks(png: bytes) -> list[bytes]:
     return found
 
 
+@pytest.mark.slow
 def test_the_copied_command_makes_the_bytes_that_the_service_makes(module: Path, tmp_path: Path) -> None:
     """For the request that the page sends: other values in two materials, other tiers, another time."""
     service_server = pytest.importorskip("service_server")

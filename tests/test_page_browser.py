@@ -19,6 +19,7 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 if CHROMIUM is None:
     pytest.skip("Chromium is not installed", allow_module_level=True)
 
+pytestmark = pytest.mark.slow
 PATIENCE = 60_000
 """[ms] Longest wait for what has to happen, on a machine whose cores are busy with other things."""
 playwright.expect.set_options(timeout=PATIENCE)

@@ -46,6 +46,7 @@ from service.problems import Problem
 distributed = pytest.importorskip("distributed")
 # Dask leaves sockets and loops of its own for the garbage collector.
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.filterwarnings("ignore::ResourceWarning"),
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]

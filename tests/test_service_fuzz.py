@@ -26,6 +26,7 @@ from service_server import BALL, PATIENT, ROOT, SMALL, Server, running, until, u
 
 from service.problems import KINDS
 
+pytestmark = pytest.mark.slow
 COUNT = int(os.environ.get("REFRACT_FUZZ", "500"))
 WORKERS = 2
 LISTENS = "0A"

@@ -15,6 +15,7 @@ from service_stages import HEAD, escapes, laughs, mutated, nested, package, refe
 
 from refract_core.images.pictures import write_map
 
+pytestmark = pytest.mark.slow
 WAYS = [(name, "render") for name in escapes("/x/y.usda")]
 WAYS += [("absolute", verb) for verb in ("inspect", "validate", "convert")]
 WORD = "Xyzzy"

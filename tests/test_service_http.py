@@ -16,6 +16,7 @@ from service_server import BALL, LONG, PATIENT, ROOT, SMALL, Server, kill, runni
 
 from refract_core.images.pictures import read_texture
 
+pytestmark = pytest.mark.slow
 GOOD = ROOT / "usd_samples" / "good"
 JSON = b"POST /v1/render HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
 SOON = 30.0

@@ -20,6 +20,8 @@ from service.metrics import Metrics
 from service.pool import Nursery
 from service.store import Store
 
+pytestmark = pytest.mark.slow
+
 
 def in_a_loop(work: Callable[[], Coroutine[Any, Any, None]]) -> None:
     asyncio.run(work())

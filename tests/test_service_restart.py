@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from service_server import BALL, LONG, PATIENCE, PATIENT, ROOT, SMALL, Server, running, runs, until, upload
 
+pytestmark = pytest.mark.slow
 GOOD = ROOT / "usd_samples" / "good"
 SECONDS = {"stage": "marble.usda", "image_width": 640, "samples": 16}
 """Some seconds of work: under way when the service is told to stop, and done in the time that is left for it."""

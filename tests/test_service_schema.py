@@ -17,6 +17,7 @@ schemathesis = pytest.importorskip("schemathesis")
 from schemathesis import config as options  # noqa: E402
 from schemathesis.engine import events, from_schema  # noqa: E402
 
+pytestmark = pytest.mark.slow
 GOOD = ROOT / "usd_samples" / "good"
 WORK = ("render", "convert", "inspect", "validate")
 TOKEN = "a-token-of-the-tests"
