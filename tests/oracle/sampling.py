@@ -1,0 +1,52 @@
+"""The engine's deterministic sequence, written again: which number belongs to which pixel, sample and purpose.
+
+All that depends on it is which of several equally right samples is taken; so this is the one place to change when the
+engine deals its dimensions anew.
+"""
+
+from __future__ import annotations
+
+import struct
+
+Key = tuple[int, int]
+"""What a sequence hangs on: a pixel, moved for the rays that follow from it."""
+
+SKY_FALLBACK, MIRROR, ROUGH_LEAF, SKY_PICK, SKY_CANDIDATE, FIRST_LIGHT = 1, 2, 3, 5, 6, 16
+SKY_CANDIDATES = 2
+
+_PLASTIC = 1.3247179572447460  # the real root of x^3 = x + 1; R2 steps by its inverse powers (Roberts 2018)
+_WORD = 0xFFFFFFFF
+
+
+def mirror_key(key: Key) -> Key:
+    return key[0] + 7919, key[1]
+
+
+def leaf_key(key: Key) -> Key:
+    return key[0] + 104729, key[1]
+
+
+def hashed(x: int, y: int, z: int) -> int:
+    """Thirty-two bits of three integers: a linear mix, then PCG's RXS-M-XS output (O'Neill 2014)."""
+    state = (x * 0x8DA6B343 + y * 0xD8163841 + z * 0xCB1AB31F) & _WORD
+    state = (state * 747796405 + 2891336453) & _WORD
+    word = ((state >> ((state >> 28) + 4)) ^ state) * 277803737 & _WORD
+    return (word >> 22) ^ word
+
+
+def pair(key: Key, sample: int, purpose: int) -> tuple[float, float]:
+    """Point `sample` of a key's rotated R2 sequence."""
+    u = hashed(*key, 2 * purpose) / 2**32 + sample / _PLASTIC
+    v = hashed(*key, 2 * purpose + 1) / 2**32 + sample / _PLASTIC**2
+    return u % 1.0, v % 1.0
+
+
+def jitter(sample: int) -> tuple[float, float]:
+    """Offset of a sample in its pixel; sample 0 is the centre."""
+    return (0.5 + sample / _PLASTIC) % 1.0 - 0.5, (0.5 + sample / _PLASTIC**2) % 1.0 - 0.5
+
+
+def float_bits(x: float) -> int:
+    """The word of a number as float32."""
+    bits: int = struct.unpack("<I", struct.pack("<f", x))[0]
+    return bits

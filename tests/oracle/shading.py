@@ -1,0 +1,207 @@
+"""Light that leaves an opaque surface: emission, lights with shadows, the environment, and one mirror bounce."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from refract_core.scene import Model, Param, Scene
+
+from . import lights, sampling
+from .sampling import Key
+from .sky import Sky
+from .surface import Surface, number, specular_albedo, surface_at
+from .vec import ZERO, Vec, add, basis, clamp, cross, dot, mul, scaled, sub, unit, vec
+from .world import NEAR, OPAQUE, Hit, World, first
+
+_MIRROR_ALPHA = 1e-3
+_COAT_F0 = (0.04, 0.04, 0.04)
+
+
+class View(NamedTuple):
+    """What one pixel's rays share."""
+
+    key: Key
+    sample: int
+    bits: tuple[int, int, int]
+    """words of the camera's ray, which decide the chance of a partly present surface on it"""
+
+
+class Gathered(NamedTuple):
+    """What arrives at a surface."""
+
+    irradiance: Vec
+    highlights: Vec
+    sky_seen: float
+    """visibility of the environment, times occlusion"""
+
+
+class Shader:
+    """A scene with all that lights it."""
+
+    def __init__(self, scene: Scene, eye: Vec) -> None:
+        self.scene = scene
+        self.world = World(scene)
+        self.sky = Sky(scene.environment) if scene.environment is not None else None
+        self.lamps = lights.lamps_of(scene, eye)
+        self.unsure = False
+        """A surface was there or not by a chance that hangs on the last bit of a ray."""
+
+    # --- Rays ---
+
+    def nearest(self, o: Vec, d: Vec, kinds: int, far: float = math.inf) -> Hit | None:
+        """First present surface of a ray that starts on one."""
+        return first(self.world.candidates(o, d, NEAR, far, kinds), lambda hit: self.present(hit, o, d, None))
+
+    def present(self, hit: Hit, o: Vec, d: Vec, bits: tuple[int, int, int] | None) -> bool:
+        """A cut-out surface is there where its opacity reaches the threshold; with `presence`, as often as its
+        opacity says. `bits`: of the camera's ray, known exactly; other rays are rounded on their way."""
+        m = self.world.material(hit)
+        if not m.cutout:
+            return True
+        opacity = number(self.scene, hit._replace(width=0.0), m, Param.OPACITY)
+        if m.opacity_threshold > 0.0:
+            return opacity >= m.opacity_threshold
+        if bits is None:
+            self.unsure = self.unsure or 0.0 < opacity < 1.0
+            bits = ray_bits(o, d)
+        return opacity > sampling.hashed(bits[0], bits[1], bits[2] ^ hit.face.part) / 2**32
+
+    def _free(self, surface: Surface, d: Vec, distance: float) -> bool:
+        return self.nearest(surface.point, d, OPAQUE, distance * (1.0 - 1e-4)) is None
+
+    # --- Light ---
+
+    def gather(self, s: Surface, key: Key, sample: int) -> Gathered:
+        irradiance, highlights = ZERO, ZERO
+        fresnel = _lowered_schlick(s)
+        coat = s.coat * (0.04 + 0.96 * (1.0 - clamp(dot(s.ns, s.wo))) ** 5)
+        for k, lamp in enumerate(self.lamps):
+            diffuse = lights.irradiance(lamp, s.point, s.ns) * lamp.diffuse
+            gloss = lights.highlight(lamp, s.point, s.ns, s.wo, s.roughness**2) * lamp.specular
+            over = coat * lights.highlight(lamp, s.point, s.ns, s.wo, s.coat_roughness**2) * lamp.specular
+            if diffuse + gloss + over <= 0.0:
+                continue
+            if lamp.kind is not None:
+                u1, u2 = sampling.pair(key, sample, sampling.FIRST_LIGHT + k)
+                d, distance = lights.shadow_target(lamp, s.point, u1, u2)
+                if not self._free(s, d, distance):
+                    continue
+            irradiance = add(irradiance, scaled(lamp.radiance, diffuse))
+            highlights = add(highlights, mul(lamp.radiance, vec([gloss * f + over for f in fresnel])))
+        seen = 0.0
+        if self.sky is not None:
+            d = self._sky_direction(self.sky, s.ns, key, sample)
+            seen = s.occlusion if self._free(s, d, math.inf) else 0.0
+            if seen > 0.0:
+                irradiance = add(irradiance, scaled(self.sky.irradiance(s.ns), seen))
+        return Gathered(irradiance, highlights, seen)
+
+    def _sky_direction(self, sky: Sky, n: Vec, key: Key, sample: int) -> Vec:
+        """Where the environment's visibility is asked: one of two bright directions, by the cosine of each (resampled
+        importance sampling, Talbot et al. 2005); a cosine-weighted one where both are under the horizon."""
+        pick = sampling.pair(key, sample, sampling.SKY_PICK)[0]
+        chosen, total = None, 0.0
+        for k in range(sampling.SKY_CANDIDATES):
+            at = sample * sampling.SKY_CANDIDATES + k
+            candidate = sky.drawn(*sampling.pair(key, at, sampling.SKY_CANDIDATE))
+            weight = max(0.0, dot(candidate, n))
+            if weight == 0.0:
+                continue
+            total += weight
+            chance = weight / total
+            if pick < chance:
+                chosen, pick = candidate, pick / chance
+            else:
+                pick = (pick - chance) / (1.0 - chance)
+        if chosen is not None:
+            return chosen
+        u1, u2 = sampling.pair(key, sample, sampling.SKY_FALLBACK)
+        x, y = basis(n)
+        phi = 2.0 * math.pi * u2
+        flat = add(scaled(x, math.cos(phi)), scaled(y, math.sin(phi)))
+        return add(scaled(flat, math.sqrt(u1)), scaled(n, math.sqrt(1.0 - u1)))
+
+    def radiance(self, hit: Hit, d: Vec, key: Key, sample: int) -> Vec:
+        """Of an opaque hit, back along the ray that met it."""
+        s = surface_at(self.scene, hit, scaled(d, -1.0))
+        g = self.gather(s, key, sample)
+        total = _without_gloss(s, g)
+        strongest = max(s.f0)
+        if strongest > 0.02 and s.roughness < (0.5 if strongest > 0.2 else 0.2):
+            total = add(total, self._mirror(s, key, sample))
+        else:
+            total = add(total, self._sky_gloss(s, g, s.f0, s.roughness))
+        if s.coat > 0.0:
+            total = add(total, scaled(self._sky_gloss(s, g, _COAT_F0, s.coat_roughness), s.coat))
+        return total
+
+    def _mirror(self, s: Surface, key: Key, sample: int) -> Vec:
+        """What a smooth surface shows, by one ray: emission, light and the environment's gloss there; no mirror in it."""
+        r = self._mirror_direction(s, key, sample)
+        hit = self.nearest(s.point, r, OPAQUE)
+        if hit is not None:
+            there = surface_at(self.scene, hit, scaled(r, -1.0))
+            g = self.gather(there, sampling.mirror_key(key), sample)
+            light = add(_without_gloss(there, g), self._sky_gloss(there, g, there.f0, there.roughness))
+        elif self.sky is not None:
+            light = self.sky.radiance(r, 0.0)
+        else:
+            return ZERO
+        return mul(light, specular_albedo(s.f0, s.roughness, _shown_cosine(s)))
+
+    def _mirror_direction(self, s: Surface, key: Key, sample: int) -> Vec:
+        h = s.ns
+        if s.roughness**2 > _MIRROR_ALPHA:
+            h = _visible_normal(s.ns, s.wo, s.roughness**2, *sampling.pair(key, sample, sampling.MIRROR))
+        r = unit(sub(scaled(h, 2.0 * dot(h, s.wo)), s.wo))
+        below = dot(r, s.ng)
+        return unit(sub(r, scaled(s.ng, 2.0 * below))) if below < 0.0 else r
+
+    def _sky_gloss(self, s: Surface, g: Gathered, f0: Vec, roughness: float) -> Vec:
+        """The environment's mirror lobe, dimmed by the visibility found for its diffuse light."""
+        if self.sky is None or g.sky_seen == 0.0:
+            return ZERO
+        r = sub(scaled(s.ns, 2.0 * dot(s.ns, s.wo)), s.wo)
+        return scaled(mul(self.sky.lobe(r, roughness), specular_albedo(f0, roughness, _shown_cosine(s))), g.sky_seen)
+
+
+def is_glass(model: Model) -> bool:
+    return model is not Model.NONE
+
+
+def ray_bits(o: Vec, d: Vec) -> tuple[int, int, int]:
+    x, y, z = (sampling.float_bits(c) for c in d)
+    return x ^ sampling.float_bits(o[0]), y, z
+
+
+def _without_gloss(s: Surface, g: Gathered) -> Vec:
+    """Emission, diffuse light and the lights' highlights."""
+    return add(add(s.emissive, scaled(mul(s.albedo, g.irradiance), 1.0 / math.pi)), g.highlights)
+
+
+def _shown_cosine(s: Surface) -> float:
+    return clamp(dot(s.ns, s.wo), 1e-3)
+
+
+def _lowered_schlick(s: Surface) -> Vec:
+    """Schlick, its grazing value lowered on rough surfaces (Lagarde 2011) and on those that hardly reflect."""
+    x = (1.0 - clamp(dot(s.ns, s.wo))) ** 5
+    top = (1.0 - s.roughness) * clamp(max(s.f0) / 0.02)
+    return vec([f + (max(top, f) - f) * x for f in s.f0])
+
+
+def _visible_normal(n: Vec, wo: Vec, alpha: float, u1: float, u2: float) -> Vec:
+    """A microfacet normal among those seen from `wo` (Heitz, "Sampling the GGX Distribution of Visible Normals",
+    JCGT 7(4) 2018, listing 1)."""
+    x, y = basis(n)
+    v = unit((alpha * dot(wo, x), alpha * dot(wo, y), dot(wo, n)))
+    flat = math.hypot(v[0], v[1])
+    t1 = (-v[1] / flat, v[0] / flat, 0.0) if flat > 0.0 else (1.0, 0.0, 0.0)
+    t2 = cross(v, t1)
+    r, phi, s = math.sqrt(u1), 2.0 * math.pi * u2, (1.0 + v[2]) / 2.0
+    a = r * math.cos(phi)
+    b = (1.0 - s) * math.sqrt(1.0 - a * a) + s * r * math.sin(phi)
+    h = add(add(scaled(t1, a), scaled(t2, b)), scaled(v, math.sqrt(max(0.0, 1.0 - a * a - b * b))))
+    h = unit((alpha * h[0], alpha * h[1], max(1e-6, h[2])))
+    return unit(add(add(scaled(x, h[0]), scaled(y, h[1])), scaled(n, h[2])))
