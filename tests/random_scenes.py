@@ -7,6 +7,7 @@ glasses; every input of every material constant, textured or by primvar; every k
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -115,22 +116,27 @@ def _driven(dice: Dice, param: Param) -> Source:
     if param is Param.ROUGHNESS and dice.chance(0.5):
         low = high = dice.pick([0.0, 0.02, 0.1, 0.15, 0.3, 0.45, 1.0])
     colour = param in _COLOURS
-    value = tuple(dice.number(low, high) for _ in range(4)) if colour else (dice.number(low, high),) * 4
+    value = _four(dice.number(low, high) for _ in range(4)) if colour else (dice.number(low, high),) * 4
     kind = dice.rng.random()
     if kind < 0.5:
         return Source(value)
     share = [dice.number(0.6, 1.0) for _ in range(4)]
-    scale = tuple((high - low) * k for k in share)
-    bias = tuple(low + (high - low) * (1 - k) * 0.5 for k in share)
+    scale = _four((high - low) * k for k in share)
+    bias = _four(low + (high - low) * (1 - k) * 0.5 for k in share)
     if kind < 0.8:
         channel = Channel.RGB if colour else dice.pick(list(Channel))
         texture = dice.pick([_FLOATS, _BYTES, _CURVED])
-        return Source(value, texture, channel, scale=scale, bias=bias, **_uv(dice))  # type: ignore[arg-type]
-    return Source(value, primvar=dice.pick(["one", "two", "three", "four", "nowhere"]), scale=scale, bias=bias)  # type: ignore[arg-type]
+        return Source(value, texture, channel, scale=scale, bias=bias, **_uv(dice))
+    return Source(value, primvar=dice.pick(["one", "two", "three", "four", "nowhere"]), scale=scale, bias=bias)
 
 
-def _inputs(dice: Dice) -> dict[str, Source]:
-    chosen = {p.name: _driven(dice, p) for p in Param if p is not Param.NORMAL}
+def _four(values: Iterable[float]) -> tuple[float, float, float, float]:
+    a, b, c, d = values
+    return (a, b, c, d)
+
+
+def _inputs(dice: Dice) -> dict[str, Any]:
+    chosen: dict[str, Any] = {p.name: _driven(dice, p) for p in Param if p is not Param.NORMAL}
     if dice.chance(0.5):
         chosen["CLEARCOAT"] = Source((0.0,) * 4)
     if dice.chance(0.4):
@@ -139,23 +145,29 @@ def _inputs(dice: Dice) -> dict[str, Source]:
     return chosen
 
 
-def _opaque(dice: Dice) -> Material:
+def _opaque(dice: Dice, may_have_holes: bool = True) -> Material:
     inputs = {**_inputs(dice), "OPACITY": Source((1.0,) * 4)}
     fields: dict[str, Any] = {"specular_workflow": dice.chance(0.4)}
-    holes = dice.rng.random()
-    if holes < 0.3:
-        inputs["OPACITY"] = Source(texture=_HOLES, channel=Channel.G, **{**_uv(dice), "uv_primvar": "st"})
-        fields["opacity_threshold" if holes < 0.2 else "opacity_presence"] = 0.45 if holes < 0.2 else True
+    if may_have_holes and dice.chance(0.2):
+        inputs["OPACITY"] = _holes(dice)
+        fields["opacity_threshold"] = 0.45
     return material("/opaque", **inputs, **fields)
 
 
-def _glass(dice: Dice, model: Model) -> Material:
+def _holes(dice: Dice) -> Source:
+    return Source(texture=_HOLES, channel=Channel.G, **{**_uv(dice), "uv_primvar": "st"})
+
+
+def _glass(dice: Dice, model: Model, may_have_holes: bool = False) -> Material:
     inputs = _inputs(dice)
     inputs["OPACITY"] = Source((0.0,) * 4) if dice.chance(0.5) else inputs["OPACITY"]
     inputs["ROUGHNESS"] = Source((0.0,) * 4) if dice.chance(0.5) else inputs["ROUGHNESS"]
+    threshold = 0.0
+    if may_have_holes and dice.chance(0.25):
+        inputs["OPACITY"], threshold = _holes(dice), 0.45
     return glass(
         model, specular_workflow=dice.chance(0.3), absorption_distance=dice.number(0.1, 1.5),
-        abbe=dice.pick([0.0, 15.0, 40.0]), **inputs,
+        abbe=dice.pick([0.0, 15.0, 40.0]), opacity_threshold=threshold, **inputs,
     )  # fmt: skip
 
 
@@ -211,7 +223,7 @@ class _Builder:
         """The table, and now and then a wall."""
         y = FLOOR
         table = [(-1.6, y, 1.6), (1.6, y, 1.6), (1.6, y, -1.6), (-1.6, y, -1.6)]
-        self.add(quad("/table", table, self.of(_opaque(self.dice))))
+        self.add(quad("/table", table, self.of(_opaque(self.dice, False))))
         if self.dice.chance(0.6):
             wall = [(-1.6, y, -1.5), (1.6, y, -1.5), (1.6, 1.2, -1.8), (-1.6, 1.2, -1.8)]
             self.add(quad("/wall", wall, self.of(_opaque(self.dice))))
@@ -221,7 +233,10 @@ class _Builder:
         dice = self.dice
         index = self.of(of)
         place = np.array([dice.number(-0.8, 0.8), dice.number(-0.1, 0.3), z])
-        kind = dice.pick(["ball", "standing", "turned", "tetra"])
+        # What touches the table ties with it: there a hole, or a face that is crossed straight, would decide which of
+        # two equally near surfaces a ray meets.
+        kinds = ["ball", "turned", "tetra"] + ["standing"] * (not of.cutout and of.model is not Model.THIN)
+        kind = dice.pick(kinds)
         if kind == "ball":
             constants = {"one": dice.rng.uniform(0, 1, (1, 1, 1)).astype(np.float32)}
             constants["st"] = dice.rng.uniform(0, 1, (1, 1, 2)).astype(np.float32)
@@ -250,8 +265,8 @@ class _Builder:
         dice = self.dice
         turn = turned((dice.number(-1, 1), 1, dice.number(-0.3, 0.3)), dice.number(-70, 70))
         corners = np.array([(-0.6, -0.45, 0), (0.6, -0.45, 0), (0.6, 0.6, 0), (-0.6, 0.6, 0)]) @ turn.T
-        what = _glass(dice, dice.pick([Model.THIN, Model.THIN, Model.TRACED, Model.BOX]))
-        self.add(quad("/pane", corners + (dice.number(-0.4, 0.4), 0.15, z), self.of(what)))
+        what = _glass(dice, dice.pick([Model.THIN, Model.THIN, Model.TRACED, Model.BOX]), may_have_holes=True)
+        self.add(quad("/pane", corners + np.array([dice.number(-0.4, 0.4), 0.15, z]), self.of(what)))
 
 
 def _lights(dice: Dice) -> tuple[Light, ...]:
@@ -263,8 +278,8 @@ def _lights(dice: Dice) -> tuple[Light, ...]:
         size = sizes.get(kind, (dice.pick([0.0, 0.15, 0.4]), 0.0))
         strong = 1.0 if kind is LightKind.DISTANT else 3.0 if size[0] == 0.0 else 12.0
         one = light(kind, place, -place + dice.point(0.4), size, strong * dice.number(0.5, 1.5))
-        tint = tuple(r * dice.number(0.5, 1.0) for r in one.radiance)
-        lights.append(replace(one, radiance=tint, diffuse=dice.pick([1.0, 0.6]), specular=dice.pick([1.0, 0.5])))
+        r, g, b = (r * dice.number(0.5, 1.0) for r in one.radiance)
+        lights.append(replace(one, radiance=(r, g, b), diffuse=dice.pick([1.0, 0.6]), specular=dice.pick([1.0, 0.5])))
     return tuple(lights)
 
 

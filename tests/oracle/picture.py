@@ -10,7 +10,7 @@ from refract_core.scene import Camera, Param, Scene
 from refract_core.settings import RenderSettings
 
 from . import optics, sampling
-from .shading import Gathered, Shader, View, ray_bits
+from .shading import Shader, View, diffuse, ray_bits
 from .surface import Surface, number, surface_at
 from .tiers import Answer, Leaf, ask
 from .vec import ZERO, Vec, add, at, clamp, dot, mul, scaled, unit, vec
@@ -161,18 +161,20 @@ class Oracle:
         clear = (1.0 - opacity) * (1.0 - share)
         refraction = scaled(through, clear)
         reflection = add(scaled(self._reflected(s, view).color, share), gathered.highlights)
-        color = add(add(refraction, reflection), scaled(_diffuse(s, gathered), opacity))
+        color = add(add(refraction, reflection), scaled(diffuse(s, gathered), opacity))
         return Layer(color, 1.0 - answer.none * clear, refraction, reflection, s, entry, exit_, answer)
 
     def _transmitted(self, s: Surface, entry: Entry, view: View) -> tuple[Vec, Exit, Answer]:
         """Light from behind, channel by channel under dispersion; the green ray stands for all in the data planes."""
         indices = optics.iors(entry.medium.ior, entry.abbe)
-        blur = 2.0 * optics.transmitted_roughness(s.roughness, entry.medium.ior) ** 2
+        hdrp = self.settings.screen == "proxy"
+        rough = optics.transmitted_roughness(s.roughness, entry.medium.ior)
         found = {}
         for ior in set(indices):
-            measured = self.settings.screen != "proxy"
-            exit_ = exit_of(self.shader, s, entry, ior, measured)
-            leaf = Leaf(exit_.point, exit_.direction, blur, exit_.status is Status.EMBEDDED)
+            exit_ = exit_of(self.shader, s, entry, ior, measured=not hdrp)
+            seen_as = s.roughness if hdrp else rough
+            embedded = exit_.status is Status.EMBEDDED
+            leaf = Leaf(exit_.point, exit_.direction, _tangent(rough), seen_as, embedded)
             found[ior] = exit_, ask(self.shader, leaf, self.settings.tiers, view)
         light = [mul(found[ior][1].color, found[ior][0].transmittance)[c] for c, ior in enumerate(indices)]
         return vec(light), *found[indices[1]]
@@ -181,7 +183,7 @@ class Oracle:
         r = optics.mirrored(scaled(s.wo, -1.0), s.ns)
         if dot(r, s.ng) <= 0.0:
             r = optics.mirrored(scaled(s.wo, -1.0), s.ng)
-        return ask(self.shader, Leaf(s.point, r, 2.0 * s.roughness**2), self.settings.tiers, view)
+        return ask(self.shader, Leaf(s.point, r, _tangent(s.roughness), s.roughness), self.settings.tiers, view)
 
     # --- Planes ---
 
@@ -246,8 +248,9 @@ class _Sums:
         return self._planes.get(name, [0.0] * count)
 
 
-def _diffuse(s: Surface, g: Gathered) -> Vec:
-    return add(s.emissive, scaled(mul(s.albedo, g.irradiance), 1.0 / math.pi))
+def _tangent(roughness: float) -> float:
+    """Of the half angle of a lobe's cone: twice the median slope, which is alpha."""
+    return 2.0 * roughness**2
 
 
 def _conformed(window: tuple[float, float, float, float], width: int, height: int) -> tuple[float, float, float, float]:

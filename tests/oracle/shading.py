@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from refract_core.scene import Model, Param, Scene
+from refract_core.scene import Param, Scene
 
 from . import lights, sampling
 from .sampling import Key
@@ -77,17 +77,17 @@ class Shader:
         fresnel = _lowered_schlick(s)
         coat = s.coat * (0.04 + 0.96 * (1.0 - clamp(dot(s.ns, s.wo))) ** 5)
         for k, lamp in enumerate(self.lamps):
-            diffuse = lights.irradiance(lamp, s.point, s.ns) * lamp.diffuse
+            even = lights.irradiance(lamp, s.point, s.ns) * lamp.diffuse
             gloss = lights.highlight(lamp, s.point, s.ns, s.wo, s.roughness**2) * lamp.specular
             over = coat * lights.highlight(lamp, s.point, s.ns, s.wo, s.coat_roughness**2) * lamp.specular
-            if diffuse + gloss + over <= 0.0:
+            if even + gloss + over <= 0.0:
                 continue
             if lamp.kind is not None:
                 u1, u2 = sampling.pair(key, sample, sampling.FIRST_LIGHT + k)
                 d, distance = lights.shadow_target(lamp, s.point, u1, u2)
                 if not self._free(s, d, distance):
                     continue
-            irradiance = add(irradiance, scaled(lamp.radiance, diffuse))
+            irradiance = add(irradiance, scaled(lamp.radiance, even))
             highlights = add(highlights, mul(lamp.radiance, vec([gloss * f + over for f in fresnel])))
         seen = 0.0
         if self.sky is not None:
@@ -137,7 +137,7 @@ class Shader:
         return total
 
     def _mirror(self, s: Surface, key: Key, sample: int) -> Vec:
-        """What a smooth surface shows, by one ray: emission, light and the environment's gloss there; no mirror in it."""
+        """What a smooth surface shows, by one ray: emission, light and the environment's gloss there, no mirrors."""
         r = self._mirror_direction(s, key, sample)
         hit = self.nearest(s.point, r, OPAQUE)
         if hit is not None:
@@ -166,18 +166,18 @@ class Shader:
         return scaled(mul(self.sky.lobe(r, roughness), specular_albedo(f0, roughness, _shown_cosine(s))), g.sky_seen)
 
 
-def is_glass(model: Model) -> bool:
-    return model is not Model.NONE
-
-
 def ray_bits(o: Vec, d: Vec) -> tuple[int, int, int]:
     x, y, z = (sampling.float_bits(c) for c in d)
     return x ^ sampling.float_bits(o[0]), y, z
 
 
+def diffuse(s: Surface, g: Gathered) -> Vec:
+    """Emission, and light without a direction."""
+    return add(s.emissive, scaled(mul(s.albedo, g.irradiance), 1.0 / math.pi))
+
+
 def _without_gloss(s: Surface, g: Gathered) -> Vec:
-    """Emission, diffuse light and the lights' highlights."""
-    return add(add(s.emissive, scaled(mul(s.albedo, g.irradiance), 1.0 / math.pi)), g.highlights)
+    return add(diffuse(s, g), g.highlights)
 
 
 def _shown_cosine(s: Surface) -> float:

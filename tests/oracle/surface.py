@@ -137,7 +137,7 @@ def _corners(hit: Hit, name: str) -> list[list[float]] | None:
     values = shape.primvars.get(name)
     if values is None or values.shape[1] == 1 or isinstance(shape, Sphere):
         return None
-    return [[float(x) for x in corner] for corner in values[hit.face.index]]
+    return [[float(x) for x in corner] for corner in values[hit.face.number]]
 
 
 def _primvar(hit: Hit, name: str) -> list[float] | None:

@@ -22,7 +22,7 @@ def sample(texture: Texture, s: float, t: float, footprint: float, wrap: tuple[W
     chain = _chain(texture)
     height, width = len(chain[0]), len(chain[0][0])
     texels = footprint * max(width, height)
-    lod = clamp_level(math.log2(texels), len(chain) - 1) if texels > 1.0 else 0.0
+    lod = min(math.log2(texels), len(chain) - 1.0) if texels > 1.0 else 0.0
     fine = int(lod)
     a = _bilinear(chain[fine], s, 1.0 - t, wrap)
     if lod == fine:
@@ -30,10 +30,6 @@ def sample(texture: Texture, s: float, t: float, footprint: float, wrap: tuple[W
     b = _bilinear(chain[fine + 1], s, 1.0 - t, wrap)
     part = lod - fine
     return _blend([(a, 1.0 - part), (b, part)])
-
-
-def clamp_level(lod: float, last: int) -> float:
-    return min(lod, float(last))
 
 
 def _chain(texture: Texture) -> list[Level]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 from . import sampling
@@ -19,6 +18,8 @@ class Leaf(NamedTuple):
     direction: Vec
     blur: float
     """tangent of the half angle of its cone"""
+    roughness: float
+    """the sky's, as the eye sees it"""
     embedded: bool = False
 
 
@@ -39,8 +40,7 @@ def ask(shader: Shader, leaf: Leaf, order: tuple[str, ...], view: View) -> Answe
                 return Answer(color, 1.0, 0.0, 0.0, 1.0)
         elif tier == "sky":
             if shader.sky is not None:
-                roughness = math.sqrt(min(1.0, leaf.blur / 2.0))  # blur is twice alpha
-                return Answer(shader.sky.lobe(leaf.direction, roughness), 0.0, 1.0, 0.0, 1.0)
+                return Answer(shader.sky.lobe(leaf.direction, leaf.roughness), 0.0, 1.0, 0.0, 1.0)
         else:
             raise NotImplementedError(f"the oracle knows no tier '{tier}'")
     return Answer(ZERO, 0.0, 0.0, 1.0, 0.0)

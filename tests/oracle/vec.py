@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 Vec = tuple[float, float, float]
 
 ZERO: Vec = (0.0, 0.0, 0.0)
 
 
-def vec(a: object) -> Vec:
+def vec(a: Iterable[float]) -> Vec:
     """Three numbers of any sequence, such as a row of an array."""
-    x, y, z = a  # type: ignore[misc]
+    x, y, z = a
     return (float(x), float(y), float(z))
 
 

@@ -24,7 +24,7 @@ class Face(NamedTuple):
     part: int
     """number among the runs of one kind (solid, cut-out, glass) that each prim falls into"""
     shape: Mesh | Sphere
-    index: int
+    number: int
     """of the triangle in its mesh"""
     material: int
     kind: int
@@ -113,7 +113,7 @@ def hit_of(t: float, face: Face, u: float, v: float, origin: Vec, direction: Vec
         return Hit(t, face, u, v, point, ng, ng)
     ns = face.ng
     if shape.normals is not None:
-        corners = [vec(n) for n in shape.normals[face.index]]
+        corners = [vec(n) for n in shape.normals[face.number]]
         weights = (1.0 - u - v, u, v)
         mean = vec([sum(w * n[c] for w, n in zip(weights, corners, strict=True)) for c in range(3)])
         ns = facing(unit(mean), face.ng) if dot(mean, mean) > 0.0 else face.ng
