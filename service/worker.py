@@ -206,9 +206,9 @@ def _say_to(path: str) -> None:
 
 def _no_new_kernels() -> None:
     """A kernel compiled here is not kept: the cache is code, and this process must not be able to write it."""
-    from numba.core import caching
+    from refract_core.kernels.compile import keep_nothing
 
-    caching.IndexDataCacheFile.save = lambda *_arguments: None
+    keep_nothing()
 
 
 def _try_to_escape(path: str) -> dict[str, str]:

@@ -1,79 +1,128 @@
-"""The one decorator of per-pixel code, and where its compiled form is kept.
+"""The decorators of per-pixel code. What they give is compiled when it is first called, not when it is defined.
 
-numba's own cache notices a change of the file a function stands in, but not of the files it calls into. A kernel here
-inlines functions of half a dozen rooms, so the cache folder is named after the sources of all of them: what is loaded
-always belongs to the code that runs.
+Nothing here knows numba: it is loaded when a kernel has to be compiled, or loaded from where it was kept.
 """
 
 from __future__ import annotations
 
-import hashlib
-import os
-import sys
+import functools
 from collections.abc import Callable
-from functools import cache
-from pathlib import Path
 from typing import Any, TypeVar, cast
 
-import numba
 import numpy as np
+
+from . import store
+from .store import cache_root, keep_nothing
+
+__all__ = ["External", "cache_root", "flag", "inlined", "is_compiled", "keep_nothing", "kernel", "leaf", "word"]
 
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
 
-_ENGINE = Path(__file__).parents[1]
 
-# Products and sums may fuse (FMA); NaN, infinity and the order of operations keep their meaning.
-FASTMATH = {"contract", "nsz"}
-
-
-def cache_root() -> Path:
-    """Folder of the compiled kernels: REFRACT_CACHE_DIR, else XDG_CACHE_HOME/refract, else ~/.cache/refract."""
-    if chosen := os.environ.get("REFRACT_CACHE_DIR"):
-        return Path(chosen)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "refract"
+_BOUND: dict[str, int] = {}
+"""Addresses of C functions by their names."""
 
 
-_COMPILED_WINGS = ("kernels", "optics", "world", "probes", "view", "transport", "thickness")
+@functools.cache
+def _jit() -> Any:
+    """The room that knows numba; it takes a third of a second to load."""
+    from . import jit
+
+    for name, address in _BOUND.items():
+        jit.bind(name, address)
+    return jit
 
 
-@cache
-def _cache_folder(module: str) -> str:
-    """Folder for the kernels of one module."""
-    room = module.rpartition(".")[2]
-    digest = hashlib.sha256(f"{sys.version_info[:2]} {numba.__version__}".encode())
-    for path in sorted([_ENGINE / "scene.py", *(p for wing in _COMPILED_WINGS for p in (_ENGINE / wing).glob("*.py"))]):
-        digest.update(path.read_bytes())
-    return str(cache_root() / "kernels" / f"{room}-{digest.hexdigest()[:16]}")
+class Kernel:
+    """A compiled function that Python calls: per tile, not per pixel."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        functools.update_wrapper(self, function)
+        self.py_func = function
+        self._compiled: Any = None
+
+    @property
+    def compiled(self) -> Any:
+        """numba's form of it, which compiles itself for the arguments it meets."""
+        if self._compiled is None:
+            self._compiled = _jit().kernel(self.py_func)
+        return self._compiled
+
+    @property
+    def _numba_type_(self) -> Any:
+        return _jit().type_of(self.compiled)
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.compiled(*arguments)
+
+
+class Inlined:
+    """A compiled function that kernels call."""
+
+    def __init__(self, function: Callable[..., Any], merged: bool) -> None:
+        functools.update_wrapper(self, function)
+        self.py_func = function
+        self.merged = merged
+        self._for_python: Any = None
+
+    @property
+    def _numba_type_(self) -> Any:
+        return _jit().type_of(_jit().inlined(self.py_func, self.merged))
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Called from Python, as tests do: compiled for that alone."""
+        if self._for_python is None:
+            self._for_python = _jit().called_from_python(self.py_func)
+        return self._for_python(*arguments)
+
+
+class External:
+    """A function of a C library that kernels call: every argument is one machine word, and it gives nothing back."""
+
+    def __init__(self, name: str, arguments: int) -> None:
+        self.name, self.arguments = name, arguments
+
+    @property
+    def key(self) -> str:
+        return f"{self.name} {self.arguments}"
+
+    @property
+    def _numba_type_(self) -> Any:
+        return _jit().external(self.name, self.arguments)
+
+    def __call__(self, *words: int) -> None:
+        raise TypeError(f"{self.name} is called by kernels, not by Python")
+
+    def bind(self, address: int) -> None:
+        """Say where the function is. Kernels that call it can be loaded only afterwards."""
+        _BOUND[self.name] = address
+        if _jit.cache_info().currsize:
+            _jit().bind(self.name, address)
 
 
 def kernel(function: Callable[..., T]) -> Callable[..., T]:
-    """Compile `function` with numba when first called (or load it), to run without the GIL.
+    """Compile `function` when first called (or load it), to run without the GIL.
 
     Division by zero gives inf or NaN as in numpy, never an exception: a ray that fails is a status.
     """
-    numba.config.CACHE_DIR = _cache_folder(function.__module__)
-    compiled: Callable[..., T] = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath=FASTMATH)(function)
+    compiled: Any = Kernel(function)
     return compiled
 
 
 def inlined(function: F) -> F:
-    """For the functions kernels call: compiled into each caller, so not cached on their own. They allocate nothing.
+    """For the functions kernels call: compiled into each caller, so not kept on their own. They allocate nothing.
 
     They never count references: otherwise each call counts every array of every table up and down, with atomics that
     all threads share (a texture sample took 137 ns that way, and takes 20).
     """
-    compiled: F = numba.njit(
-        _nrt=False, nogil=True, error_model="numpy", fastmath=FASTMATH, no_cfunc_wrapper=True
-    )(function)
+    compiled: Any = Inlined(function, False)
     return compiled
 
 
 def leaf(function: F) -> F:
     """As `inlined`, for functions small enough to be merged into every caller."""
-    compiled: F = numba.njit(
-        _nrt=False, forceinline=True, nogil=True, error_model="numpy", fastmath=FASTMATH, no_cfunc_wrapper=True
-    )(function)
+    compiled: Any = Inlined(function, True)
     return compiled
 
 
@@ -92,6 +141,6 @@ def flag(value: bool) -> bool:
 
 def is_compiled(compiled: Callable[..., Any]) -> bool:
     """A compiled form of this kernel is in memory or on disk."""
-    signatures: Any = getattr(compiled, "signatures", ())
-    folder = Path(_cache_folder(compiled.__module__))
-    return bool(signatures) or any(folder.rglob(f"*{compiled.__name__}*.nbc"))
+    assert isinstance(compiled, Kernel)
+    in_memory = compiled._compiled is not None and bool(compiled._compiled.signatures)
+    return in_memory or store.is_kept(compiled.py_func)

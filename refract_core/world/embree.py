@@ -1,8 +1,8 @@
 """Embree 4 through its own C API: the device, one BVH, and the packet queries that kernels call.
 
 The library is the `libembree4` inside the `embreex` wheel; embreex itself is never imported (its wrapper has no masks,
-no packets and one thread per call). `rtcIntersect8` and `rtcOccluded8` are registered as LLVM symbols, so compiled
-kernels call them directly and can be cached on disk: addresses are looked up by name at load time.
+no packets and one thread per call). Compiled kernels call `rtcIntersect8` and `rtcOccluded8` directly, and by name, so
+that they can be kept on disk: what the addresses are is said when the library is opened.
 """
 
 from __future__ import annotations
@@ -14,13 +14,11 @@ from functools import cache
 from importlib import metadata
 from typing import Any, NamedTuple
 
-import llvmlite.binding as llvm
 import numpy as np
-from numba import types
 from numpy.typing import NDArray
 
 from ..errors import EmbreeError, SceneError
-from ..kernels.compile import flag, inlined, word
+from ..kernels.compile import External, flag, inlined, word
 from ..kernels.lanes import LANES, Flags, Scalars
 from ..kernels.vec import Vec
 
@@ -53,15 +51,13 @@ ORG_X, ORG_Y, ORG_Z, T_NEAR, DIR_X, DIR_Y, DIR_Z, TIME, T_FAR, MASK, RAY_ID, FLA
 NG_X, NG_Y, NG_Z, HIT_U, HIT_V, PRIM, GEOM, INST, INST_PRIM = range(12, 21)
 _WORDS = 21
 
-_rtc_intersect8 = types.ExternalFunction(
-    "rtcIntersect8", types.void(types.intp, types.intp, types.intp, types.intp)
-)
-_rtc_occluded8 = types.ExternalFunction("rtcOccluded8", types.void(types.intp, types.intp, types.intp, types.intp))
+_rtc_intersect8 = External("rtcIntersect8", 4)
+_rtc_occluded8 = External("rtcOccluded8", 4)
 
 
 @cache
 def library() -> ctypes.CDLL:
-    """Open the bundled Embree once and make its query functions known to LLVM.
+    """Open the bundled Embree once and tell kernels where its query functions are.
 
     Raises:
         EmbreeError: the embreex wheel, or the library in it, is not there.
@@ -94,10 +90,10 @@ def library() -> ctypes.CDLL:
     for name, (result, arguments) in signatures.items():
         function = getattr(lib, name)
         function.restype, function.argtypes = result, arguments
-    for name in ("rtcIntersect8", "rtcOccluded8"):
-        address = ctypes.cast(getattr(lib, name), ctypes.c_void_p).value
+    for query in (_rtc_intersect8, _rtc_occluded8):
+        address = ctypes.cast(getattr(lib, query.name), ctypes.c_void_p).value
         assert address is not None
-        llvm.add_symbol(name, address)
+        query.bind(address)
     return lib
 
 
