@@ -201,3 +201,42 @@ print(is_kept(twice.py_func))
 """
     assert outputs(program.replace("WISH", "True"), tmp_path, ROOT) == "False\n"
     assert outputs(program.replace("WISH", "False"), tmp_path, ROOT) == "True\n"
+
+
+# --- one kernel, one optimisation
+
+
+def test_a_function_of_kernels_has_no_entry_for_python(tmp_path: Path) -> None:
+    """Calling what has no machine code is a TypeError, not the end of the process; what is called by name works."""
+    (tmp_path / "own.py").write_text(
+        "from refract_core.kernels.compile import inlined\n@inlined\ndef twice(x):\n    return 2.0 * x\n"
+        "@inlined\ndef more(x):\n    return twice(x) + 1.0\n"
+    )
+    program = """
+import own
+from refract_core.kernels import jit, linking
+assert linking.is_known()
+bare = jit.inlined(own.twice.py_func, False)
+try:
+    bare(2.0)
+except TypeError:
+    print(own.twice(2.0), own.more(2.0))
+"""
+    assert outputs(program, tmp_path, ROOT) == "4.0 5.0\n"
+
+
+def test_a_numba_that_was_not_tried_compiles_as_it_does_by_itself(tmp_path: Path) -> None:
+    """The same values from a version whose inner classes may be others."""
+    (tmp_path / "caller.py").write_text(CALLER)
+    (tmp_path / "between.py").write_text(BETWEEN)
+    (tmp_path / "called.py").write_text(CALLED)
+    program = """
+import os, numba
+numba.__version__ = "0.99.0"
+os.environ["REFRACT_CACHE_DIR"] = CACHE
+from refract_core.kernels import linking
+assert not linking.is_known() and not linking.KERNEL and not linking.TEXT
+import caller
+print(caller.outer(2.0), caller.outer(-2.0))
+"""
+    assert outputs(program.replace("CACHE", repr(str(tmp_path / "cache"))), tmp_path, ROOT) == "7.0 -3.0\n"

@@ -16,7 +16,7 @@ import numba
 from numba import types
 from numba.core.caching import CompileResultCacheImpl, FunctionCache
 
-from . import pointer_type, store
+from . import linking, pointer_type, store
 
 __all__ = ["bind", "called_from_python", "external", "inlined", "kernel", "pointer_type", "type_of"]
 
@@ -73,14 +73,14 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 def kernel(function: Callable[..., Any]) -> Any:
     """numba's form of a kernel, which Python may call, and which is kept on disk."""
     with _ONE_AT_A_TIME:
-        made = numba.njit(**OPTIONS)(function)
+        made = numba.njit(**OPTIONS, **linking.KERNEL)(function)
         made._cache = _Cache(function)
         return made
 
 
 @cache
 def _inlined(function: Callable[..., Any], merged: bool) -> Any:
-    return numba.njit(_nrt=False, forceinline=merged, no_cfunc_wrapper=True, **OPTIONS)(function)
+    return numba.njit(_nrt=False, forceinline=merged, no_cfunc_wrapper=True, **OPTIONS, **linking.TEXT)(function)
 
 
 def inlined(function: Callable[..., Any], merged: bool) -> Any:
@@ -92,7 +92,7 @@ def inlined(function: Callable[..., Any], merged: bool) -> Any:
 def called_from_python(function: Callable[..., Any]) -> Any:
     """A function of kernels on its own, for Python; it is not kept."""
     with _ONE_AT_A_TIME:
-        return numba.njit(_nrt=False, **OPTIONS)(function)
+        return numba.njit(_nrt=False, **OPTIONS, **linking.KERNEL)(function)
 
 
 def type_of(made: Any) -> Any:

@@ -22,7 +22,7 @@ import numpy as np
 
 _FOREIGN = ("builtins", "cmath", "math", "numba", "numpy", "operator")
 """Libraries that numba has its own versions of; its version stands for theirs."""
-_MACHINERY = ("pointer", "pointer_type", "jit")
+_MACHINERY = ("pointer", "pointer_type", "jit", "linking")
 """The rooms beside this one whose code decides what is compiled."""
 
 
