@@ -80,7 +80,7 @@ class Kernel(JITCodeLibrary):  # type: ignore[misc]
         for library in _callees(self):
             self._final_module.link_in(_module_of(library), preserve=True)
             self._reload_init.update(library._reload_init)
-        self._linking_libraries = []
+        self._linking_libraries.clear()
         super().finalize()
 
 
