@@ -5,7 +5,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from refract_core.bsdf import _ALBEDO_A, _ALBEDO_B  # the fit of a Monte Carlo integral; it has a test of its own
+from refract_core.optics.lobes import (  # the fit of a Monte Carlo integral; it has a test of its own
+    _ALBEDO_A,
+    _ALBEDO_B,
+)
 from refract_core.scene import Channel, Material, Mesh, Param, Scene, Source, Sphere
 
 from . import textures
