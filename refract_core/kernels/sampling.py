@@ -1,30 +1,98 @@
-"""The one deterministic sequence behind every sample: a function of pixel, sample number and purpose, nothing else.
+"""The one deterministic sequence behind every sample: a function of pixel, branch, sample number and purpose.
 
 Samples of one pixel follow the R2 sequence (M. Roberts, "The unreasonable effectiveness of quasirandom sequences",
 2018); pixels are decorrelated by a Cranley-Patterson rotation from an integer hash (PCG output permutation,
 O'Neill 2014). No state: tiles, threads and order cannot change a picture.
+
+Every decision has a dimension of its own: its `Purpose` within its branch. A branch is a ray that follows from another
+(what a mirror shows, what a ray tier meets), numbered by the way to it, so that the shadow of a light there has nothing
+to do with the shadow of the same light here.
 """
 
 from __future__ import annotations
 
+from enum import IntEnum
+from typing import NamedTuple
+
 import numpy as np
 
 from .compile import inlined
+from .lanes import Words
 
 _A1 = 0.7548776662466927  # 1 / g, g = plastic number
 _A2 = 0.5698402909980532  # 1 / g^2
 _TO_UNIT = 1.0 / 4294967296.0
 
 
+class Purpose(IntEnum):
+    """What a sample decides. Each is a dimension of a branch."""
+
+    SKY_BELOW = 1
+    """a direction of the sky where every candidate was below the horizon"""
+    MIRROR = 2
+    """the microfacet that a mirror ray is reflected by"""
+    ROUGH_LEAF = 3
+    """the ray of a rough lobe that a tier traces"""
+    SKY_PICK = 5
+    """which of the sky's candidates"""
+    SKY_CANDIDATE = 6
+    """a candidate of the sky"""
+    LIGHT = 16
+    """a point of light 0; those of the other lights follow"""
+
+
+_PURPOSES = 1 << 12
+"""Dimensions of a branch; lights beyond so many share theirs with another branch."""
+
+# How a branch goes on from the one before it: the next digit, to the base 4, of its number.
+MIRRORED, LEAF = 1, 2
+
+
+class Key(NamedTuple):
+    """What a sequence hangs on."""
+
+    x: int
+    y: int
+    """pixel, or texel of a probe's picture"""
+    branch: int
+    """0 for what the pixel's own ray meets; see `branched`"""
+
+
+class Keys(NamedTuple):
+    """The keys of eight rays."""
+
+    x: Words
+    y: Words
+    branch: Words
+
+
 @inlined
-def hash32(x, y, purpose):  # type: ignore[no-untyped-def]
+def set_key(keys: Keys, lane: int, key: Key) -> None:
+    """Note the key of a lane."""
+    keys.x[lane], keys.y[lane], keys.branch[lane] = key.x, key.y, key.branch
+
+
+@inlined
+def key_of(keys: Keys, lane: int) -> Key:
+    """The key of a lane."""
+    return Key(keys.x[lane], keys.y[lane], keys.branch[lane])
+
+
+@inlined
+def branched(key: Key, step: int) -> Key:
+    """The key of a ray that follows from one with `key`, by a step of MIRRORED or LEAF."""
+    return Key(key.x, key.y, 4 * key.branch + step)
+
+
+@inlined
+def hash32(x: int, y: int, z: int) -> int:
     """Thirty-two well mixed bits of three integers."""
     state = np.uint32(np.uint32(x) * np.uint32(0x8DA6B343) + np.uint32(y) * np.uint32(0xD8163841))
-    state = np.uint32(state + np.uint32(purpose) * np.uint32(0xCB1AB31F))
+    state = np.uint32(state + np.uint32(z) * np.uint32(0xCB1AB31F))
     state = np.uint32(state * np.uint32(747796405) + np.uint32(2891336453))
     word = np.uint32((state >> ((state >> np.uint32(28)) + np.uint32(4))) ^ state)
     word = np.uint32(word * np.uint32(277803737))
-    return np.uint32((word >> np.uint32(22)) ^ word)
+    return np.uint32((word >> np.uint32(22)) ^ word)  # type: ignore[return-value]
 
 
 @inlined
@@ -34,10 +102,11 @@ def chance_of_bits(a: int, b: int, c: int) -> float:
 
 
 @inlined
-def unit_pair(x, y, sample, purpose):  # type: ignore[no-untyped-def]
-    """Point `sample` of the pixel's rotated R2 sequence in [0, 1)^2, for one purpose (a light, a lobe, ...)."""
-    u = hash32(x, y, 2 * purpose) * _TO_UNIT + sample * _A1
-    v = hash32(x, y, 2 * purpose + 1) * _TO_UNIT + sample * _A2
+def unit_pair(key: Key, sample: int, purpose: int) -> tuple[float, float]:
+    """Point `sample` of the key's rotated R2 sequence in [0, 1)^2, for one `Purpose`."""
+    dimension = _PURPOSES * key.branch + purpose
+    u = hash32(key.x, key.y, 2 * dimension) * _TO_UNIT + sample * _A1
+    v = hash32(key.x, key.y, 2 * dimension + 1) * _TO_UNIT + sample * _A2
     return u - np.floor(u), v - np.floor(v)
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..kernels.compile import inlined, kernel
 from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Scalars, scratch
 from ..kernels.pointer import Pointer
-from ..kernels.sampling import pixel_offset
+from ..kernels.sampling import Key, pixel_offset, set_key
 from ..kernels.vec import along, length, normalize, row, scale, transform_direction, transform_point
 from ..scene import Cubemap
 from ..world.embree import COHERENT, Packet, clear, set_ray
@@ -73,7 +73,7 @@ def capture_rows(world, table, scratch, k, face, y0, y1, volume, mask, near, far
                     x, y = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
                     if x >= n or y >= y1:
                         continue
-                    block.pixel[lane, 0], block.pixel[lane, 1] = x + n * face, y + 4099 * seed
+                    set_key(block.key, lane, Key(x + n * face, y, seed))
                     u = (x + 0.5 + jitter[sample, 0]) / n * 2.0 - 1.0
                     v = (y + 0.5 + jitter[sample, 1]) / n * 2.0 - 1.0
                     if planar:

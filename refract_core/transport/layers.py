@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..kernels.compile import inlined, kernel
 from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Scalars, Vectors, Words, put
+from ..kernels.sampling import Key, set_key
 from ..kernels.vec import dot, row, scale
 from ..optics.interface import channel_iors, fresnel_dielectric, reflect, transmitted_roughness
 from ..scene import Param
@@ -153,8 +154,8 @@ def _load_entries(
         some = True
         at, direction, z = view_point(view, layer, world, x, y)
         block.on[lane] = 1
-        block.pixel[lane, 0], block.pixel[lane, 1] = x, y
-        query.pixel[lane, 0], query.pixel[lane, 1] = x, y
+        set_key(block.key, lane, Key(x, y, 0))
+        set_key(query.key, lane, Key(x, y, 0))
         load_surface(block, lane, at, world, scale(direction, -1.0))
         if dot(row(block.ns, lane), direction) >= 0.0:  # interpolated normals may face away at silhouettes
             put(block.ns, lane, row(block.ng, lane))

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels.compile import flag, inlined
-from ..kernels.lanes import LANES, Column, Flags, Pairs, Scalars, Vectors, Words
-from ..kernels.sampling import unit_pair
+from ..kernels.lanes import LANES, Column, Flags, Scalars, Vectors, Words
+from ..kernels.sampling import LEAF, Keys, Purpose, branched, key_of, set_key, unit_pair
 from ..kernels.vec import Vec, add, frame, normalize, row, scale
 from ..optics.interface import screen_lod_hdrp
 from ..probes.lookup import ProbeTable, influence, probe_light, proxy_distance
@@ -35,7 +35,6 @@ BY_MARCH = flag(False)
 NONE = 4
 """Column of the weights for what no tier answered."""
 EMBEDDED_ONLY, ALL_RAYS = flag(True), flag(False)
-_ROUGH_RAY = 3  # purpose of the sampling sequence
 _SPENT = 1.0 - 1e-6
 
 
@@ -47,8 +46,8 @@ class Query(NamedTuple):
     """Eight rays that want a colour, and what they got."""
 
     on: Flags
-    pixel: Pairs
-    """x, y of the pixel that asks"""
+    key: Keys
+    """of the pixel that asks"""
     z_self: Scalars
     """its own z_depth [m]"""
     origin: Vectors
@@ -160,7 +159,7 @@ def _ask_screen(query: Query, lane: int, asking: Asking, by_proxy: bool) -> None
             return
         distance = proxy_distance(asking.probes, k, origin, direction)
         lod = screen_lod_hdrp(query.roughness[lane], screen.color_level.shape[0])
-        px, py = query.pixel[lane, 0] + 0.5, query.pixel[lane, 1] + 0.5
+        px, py = query.key.x[lane] + 0.5, query.key.y[lane] + 0.5
         color, w, confidence = screen_proxy(screen, origin, direction, distance, px, py, query.z_self[lane], lod)
     else:
         color, w, confidence = screen_march(screen, origin, direction, query.blur[lane])
@@ -219,11 +218,11 @@ def _ask_rays(query: Query, embedded: bool, work: TierScratch, world: World, sam
             continue
         some = True
         d = row(query.direction, lane)
-        x, y = query.pixel[lane, 0], query.pixel[lane, 1]
+        key = key_of(query.key, lane)
         if query.blur[lane] > 0.0:
-            u1, u2 = unit_pair(x, y, sample, _ROUGH_RAY)
+            u1, u2 = unit_pair(key, sample, Purpose.ROUGH_LEAF.value)
             d = _scatter(d, query.blur[lane], u1, u2)
-        second.pixel[lane, 0], second.pixel[lane, 1] = x + 104729, y
+        set_key(second.key, lane, branched(key, LEAF))
         work.far[lane] = math.inf
         set_ray(packet, lane, row(query.origin, lane), d, 0.0, math.inf, OPAQUE)
     if not some:

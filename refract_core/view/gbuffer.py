@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..kernels.compile import inlined, kernel
 from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Flags, Scalars
+from ..kernels.sampling import Key, set_key
 from ..kernels.vec import Vec, dot
 from ..scene import Model
 from ..world.embree import (
@@ -160,7 +161,7 @@ def opaque_tile(
                 x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
                 if x < width and y < height:
                     far[lane] = add_view_ray(packet, view, lane, x, y, 0.0, math.inf, EVERYTHING)
-                    block.pixel[lane, 0], block.pixel[lane, 1] = x, y
+                    set_key(block.key, lane, Key(x, y, 0))
             intersect_world(packet, world, far, COHERENT)
             behind = False
             for lane in range(LANES):

@@ -11,8 +11,8 @@ import math
 from typing import NamedTuple
 
 from ..kernels.compile import inlined
-from ..kernels.lanes import LANES, Flags, Pairs, Scalars, Vectors, put
-from ..kernels.sampling import unit_pair
+from ..kernels.lanes import LANES, Flags, Scalars, Vectors, put
+from ..kernels.sampling import MIRRORED, Keys, Purpose, branched, key_of, set_key, unit_pair
 from ..kernels.vec import Vec, add, dot, flip_towards, frame, lerp, mul, normalize, row, scale, sub
 from ..optics.interface import f0_from_ior
 from ..optics.lobes import MIRROR_ALPHA, sample_half_vector, specular_albedo
@@ -31,8 +31,6 @@ _POLISHED_ROUGHNESS = 0.2
 take their reflection from the environment map alone."""
 _COAT_F0 = 0.04  # a clear coat of ior 1.5 (UsdPreviewSurface)
 _SKY_CANDIDATES = 2
-# Purposes of the sampling sequence; lights use 16 + their number.
-_SKY, _MIRROR = 1, 2
 
 
 class Block(NamedTuple):
@@ -40,8 +38,8 @@ class Block(NamedTuple):
 
     on: Flags
     """1 where the lane holds a hit"""
-    pixel: Pairs
-    """x, y: keys of the sampling sequence. Set by whoever asks, before anything is loaded"""
+    key: Keys
+    """of the sampling sequence. Set by whoever asks, before anything is loaded"""
 
     # The surfaces, from `load_surface` until the lane is loaded again.
     point: Vectors
@@ -179,7 +177,7 @@ def _gather_lights(block: Block, packet: Packet, world: World, sample: int, mask
             block.lamp_specular[lane] = highlight(lights, l, p, n, wo, gloss * gloss) * lights.specular[l]
             arrives = block.lamp_diffuse[lane] + block.lamp_specular[lane] > 0.0
             if arrives and lights.kind[l] != CAMERA_LIGHT:
-                u1, u2 = unit_pair(block.pixel[lane, 0], block.pixel[lane, 1], sample, 16 + l)
+                u1, u2 = unit_pair(key_of(block.key, lane), sample, Purpose.LIGHT.value + l)
                 direction, distance = shadow_ray(lights, l, p, u1, u2)
                 add_shadow_ray(packet, lane, p, row(block.ng, lane), direction, distance)
         if lights.kind[l] != CAMERA_LIGHT:
@@ -222,13 +220,13 @@ def _gather_sky(block: Block, packet: Packet, world: World, sample: int, mask: i
     for lane in range(LANES):
         if block.on[lane] == 0:
             continue
-        x, y = block.pixel[lane, 0], block.pixel[lane, 1]
+        key = key_of(block.key, lane)
         n = row(block.ns, lane)
         direction = n
         total = 0.0
-        pick = unit_pair(x, y, sample, _SKY + 4)[0]
+        pick = unit_pair(key, sample, Purpose.SKY_PICK.value)[0]
         for k in range(_SKY_CANDIDATES):
-            u1, u2 = unit_pair(x, y, sample * _SKY_CANDIDATES + k, _SKY + 5)
+            u1, u2 = unit_pair(key, sample * _SKY_CANDIDATES + k, Purpose.SKY_CANDIDATE.value)
             candidate, _ = sample_direction(environment, u1, u2)
             w = max(0.0, dot(candidate, n))
             if w > 0.0:
@@ -240,7 +238,7 @@ def _gather_sky(block: Block, packet: Packet, world: World, sample: int, mask: i
                 else:
                     pick = (pick - chance) / max(1.0 - chance, 1e-9)
         if total == 0.0:  # all candidates were below the horizon
-            a, b = unit_pair(x, y, sample, _SKY)
+            a, b = unit_pair(key, sample, Purpose.SKY_BELOW.value)
             direction = _cosine_direction(n, a, b)
         add_shadow_ray(packet, lane, row(block.point, lane), row(block.ng, lane), direction, math.inf)
     visible(packet, world, mask, seen)
@@ -336,8 +334,7 @@ def shade(block: Block, second: Block, packet: Packet, world: World, sample: int
 def _add_mirrored(block: Block, second: Block, packet: Packet, world: World, sample: int, mask: int) -> None:
     """Trace the mirror rays in the packet, and add what they see. It is lit, but mirrors nothing itself any more."""
     for lane in range(LANES):
-        second.pixel[lane, 0] = block.pixel[lane, 0] + 7919
-        second.pixel[lane, 1] = block.pixel[lane, 1]
+        set_key(second.key, lane, branched(key_of(block.key, lane), MIRRORED))
     intersect_world(packet, world, block.bounce_end, SCATTERED)
     load_hits(second, packet, world, 0.0)
     _shade_without_bounce(second, packet, world, sample, mask)
@@ -363,7 +360,7 @@ def _add_mirror_ray(block: Block, lane: int, packet: Packet, sample: int, mask: 
     alpha = block.roughness[lane] ** 2
     h = n
     if alpha > MIRROR_ALPHA:
-        u1, u2 = unit_pair(block.pixel[lane, 0], block.pixel[lane, 1], sample, _MIRROR)
+        u1, u2 = unit_pair(key_of(block.key, lane), sample, Purpose.MIRROR.value)
         h = sample_half_vector(n, wo, alpha, u1, u2)
     r = normalize(sub(scale(h, 2.0 * dot(h, wo)), wo))
     ng = row(block.ng, lane)

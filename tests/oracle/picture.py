@@ -100,7 +100,7 @@ class Oracle:
         jx, jy = sampling.jitter(k)
         px, py = x + 0.5 + jx, y + 0.5 + jy
         straight = self.ray(px, py)
-        view = View((x, y), k, ray_bits(straight.origin, straight.direction))
+        view = View((x, y, 0), k, ray_bits(straight.origin, straight.direction))
         ray = self.ray(px + nudge[0], py + nudge[1])
         opaque = self._first_opaque(ray, view)
         entries = self._entries(ray, view, ray.far if opaque is None else opaque.t)

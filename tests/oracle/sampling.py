@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import struct
 
-Key = tuple[int, int]
-"""What a sequence hangs on: a pixel, moved for the rays that follow from it."""
+Key = tuple[int, int, int]
+"""What a sequence hangs on: a pixel, and the branch, the way to the ray as digits to the base 4."""
 
 SKY_FALLBACK, MIRROR, ROUGH_LEAF, SKY_PICK, SKY_CANDIDATE, FIRST_LIGHT = 1, 2, 3, 5, 6, 16
 SKY_CANDIDATES = 2
@@ -19,11 +19,11 @@ _WORD = 0xFFFFFFFF
 
 
 def mirror_key(key: Key) -> Key:
-    return key[0] + 7919, key[1]
+    return key[0], key[1], 4 * key[2] + 1
 
 
 def leaf_key(key: Key) -> Key:
-    return key[0] + 104729, key[1]
+    return key[0], key[1], 4 * key[2] + 2
 
 
 def hashed(x: int, y: int, z: int) -> int:
@@ -36,8 +36,10 @@ def hashed(x: int, y: int, z: int) -> int:
 
 def pair(key: Key, sample: int, purpose: int) -> tuple[float, float]:
     """Point `sample` of a key's rotated R2 sequence."""
-    u = hashed(*key, 2 * purpose) / 2**32 + sample / _PLASTIC
-    v = hashed(*key, 2 * purpose + 1) / 2**32 + sample / _PLASTIC**2
+    x, y, branch = key
+    dimension = 4096 * branch + purpose
+    u = hashed(x, y, 2 * dimension) / 2**32 + sample / _PLASTIC
+    v = hashed(x, y, 2 * dimension + 1) / 2**32 + sample / _PLASTIC**2
     return u % 1.0, v % 1.0
 
 
