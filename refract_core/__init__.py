@@ -11,9 +11,17 @@ Names are loaded when first used: importing the package alone loads neither USD 
 from __future__ import annotations
 
 import importlib
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .version import __version__
+
+if not (Path(__file__).parent / "schemas").is_dir():
+    # A checkout keeps schemas/ and service/ beside this package, a wheel inside it. By `refract_core.schemas` they are
+    # found in both, and never somebody else's, whatever lies first on sys.path.
+    __path__.append(str(Path(__file__).parents[1]))
+
+from .usd.registering import register_with_usd
 
 if TYPE_CHECKING:
     from .errors import Cancelled, EmbreeError, ImageError, RefractError, SceneError, StageError, UsageError
@@ -73,3 +81,6 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
+
+
+register_with_usd()

@@ -7,17 +7,22 @@ import hashlib
 import os
 from pathlib import Path
 
+import refract_core
+
 _ENGINE: list[str] = []
 
 
 def engine() -> str:
     """Version of all that makes a result: release and sources."""
     if not _ENGINE:
+        from refract_core.usd.registering import FOLDER
         from refract_core.version import __version__
 
         digest = hashlib.sha256()
-        here = Path(__file__).resolve().parents[1]
-        for path in sorted([*(here / "refract_core").rglob("*.py"), *(here / "service").glob("*.py")]):
+        service, core = Path(__file__).resolve().parent, Path(refract_core.__file__).resolve().parent
+        inside = {service, FOLDER}  # of the engine's own folder in a wheel, beside it in a checkout: the same digest
+        engine = [path for path in sorted(core.rglob("*.py")) if not inside.intersection(path.parents)]
+        for path in (*engine, *sorted(service.glob("*.py")), FOLDER / "generatedSchema.usda"):
             digest.update(path.read_bytes())
         _ENGINE.append(f"{__version__}+{digest.hexdigest()[:12]}")
     return _ENGINE[0]

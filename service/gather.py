@@ -1,7 +1,7 @@
 """Which files a stage under the stage root is made of, found out by a process that can do nothing else.
 
-`python -m service.gather ROOT STAGE LAYERS BYTES` prints one line of JSON: `{"files": [...]}`, relative to ROOT, or
-`{"problem": ...}` as a worker would say it.
+`python -m refract_core.service.gather ROOT STAGE LAYERS BYTES` prints one line of JSON: `{"files": [...]}`, relative to
+ROOT, or `{"problem": ...}` as a worker would say it.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+import refract_core
 
 from . import confine
 from .problems import Problem
@@ -30,8 +32,9 @@ async def files_of(root: str, stage: str, limits: Mapping[str, int]) -> list[str
         Problem: the stage reaches out of `root`, or cannot be read.
     """
     process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "service.gather", root, stage, str(limits["layers"]), str(limits["stage_bytes"]),
-        cwd=Path(__file__).parents[1], env=environment(), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+        sys.executable, "-m", "refract_core.service.gather", root, stage, str(limits["layers"]),
+        str(limits["stage_bytes"]),
+        cwd=Path(refract_core.__file__).parents[1], env=environment(), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
     )  # fmt: skip
     try:

@@ -13,6 +13,8 @@ import sys
 from pathlib import Path
 from typing import Any, Protocol
 
+import refract_core
+
 from .worker import environment
 
 log = logging.getLogger("refract.service")
@@ -130,8 +132,8 @@ class Nursery:
         self._control = ours
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "service.worker", str(theirs.fileno())], pass_fds=[theirs.fileno()],
-                cwd=Path(__file__).parents[1], env=environment(), stdin=subprocess.DEVNULL, stdout=2,
+                [sys.executable, "-m", "refract_core.service.worker", str(theirs.fileno())], pass_fds=[theirs.fileno()],
+                cwd=Path(refract_core.__file__).parents[1], env=environment(), stdin=subprocess.DEVNULL, stdout=2,
             )  # fmt: skip
         log.info("the first worker is getting warm; where kernels are to be compiled first, it takes about a minute")
         loop = asyncio.get_running_loop()

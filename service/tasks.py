@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+import refract_core
 from refract_core.errors import EmbreeError, ImageError, RefractError, SceneError, StageError, UsageError
 from refract_core.images.aovs import AOVS
 from refract_core.scene import Notice, Scene
@@ -72,7 +73,7 @@ def _public(text: str) -> str:
     text = re.sub(_QUOTES, "", text).strip()
     for folder in sorted({os.getcwd(), os.path.realpath("."), os.path.dirname(os.getcwd())}, key=len, reverse=True):
         text = text.replace(folder + os.sep, "")
-    for known in (os.path.expanduser("~"), os.path.dirname(os.path.dirname(__file__))):
+    for known in (os.path.expanduser("~"), os.path.dirname(os.path.dirname(refract_core.__file__))):
         text = text.replace(known, "")
     return text[:500]
 

@@ -1,8 +1,8 @@
 """The process that is never given a stage, and its children, which are given one each.
 
-`python -m service.worker FD` loads everything once (imports, compiled kernels), with a single thread, and then forks
-at the server's word: a fork of it is warm at once. A child waits on its own socket for one job, locks itself into the
-job's folder, and only then opens the stage. Nothing a child does comes back to its parent but its exit code.
+`python -m refract_core.service.worker FD` loads everything once (imports, compiled kernels), with a single thread, and
+then forks at the server's word: a fork of it is warm at once. A child waits on its own socket for one job, locks itself
+into the job's folder, and only then opens the stage. Nothing a child does comes back to its parent but its exit code.
 
 Messages are JSON. Server to this process: {"fork": id} with a socket, {"kill": id}; back: {"ready": ...},
 {"ended": id, "code": n}. Server to a child: one line, the job; back: `began`, lines of progress and warnings, and one
@@ -68,11 +68,14 @@ def _warm() -> int:
     """Load everything. Returns the number of threads there are then; above 1, a fork would not be safe."""
     cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(cores)})  # Embree starts a thread for every further core it sees
-    import schemas
+    import refract_core.usd.rules.look
+    import refract_core.usd.rules.stage
+    import refract_core.usd.stage
+    import refract_core.verbs.convert
+    import refract_core.verbs.inspect  # noqa: F401
 
     from . import precheck, tasks, warm  # noqa: F401  the first is needed once USD is open
 
-    schemas.register()
     warm.draw()
     os.sched_setaffinity(0, cores)
     return len(os.listdir("/proc/self/task"))
@@ -187,10 +190,11 @@ def _perform(job: dict[str, Any], say: Any) -> Any:
 
 def own_files() -> list[str]:
     """What the program itself is made of, and nothing else of the machine."""
+    import refract_core
     from refract_core.kernels.compile import cache_root
+    from refract_core.usd.registering import FOLDER
 
-    here = Path(__file__).resolve().parents[1]
-    own = [str(here / name) for name in ("refract_core", "schemas", "service")]
+    own = [str(Path(refract_core.__file__).parent), str(FOLDER), str(Path(__file__).parent)]
     system = ["/usr/lib", "/lib", "/lib64", "/etc/ld.so.cache", "/dev/null", "/dev/urandom", "/proc/cpuinfo",
               "/proc/meminfo", "/sys/devices/system/cpu"]  # fmt: skip
     return [*own, str(cache_root()), *{sys.prefix, sys.base_prefix}, *system]

@@ -67,6 +67,12 @@ def under(name: str, room: str) -> bool:
     return name == room or name.startswith(f"{room}.")
 
 
+def in_checkout(name: str) -> str:
+    """`refract_core.schemas` and `refract_core.service` by the names that their folders have in a checkout."""
+    inner = name.removeprefix("refract_core.")
+    return inner if under(inner, "schemas") or under(inner, "service") else name
+
+
 def module_name(path: Path) -> str:
     parts = path.relative_to(ROOT).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
@@ -95,7 +101,7 @@ def statements(body: list[ast.stmt], on_load: bool) -> Iterator[tuple[ast.Import
 def targets(node: ast.Import | ast.ImportFrom, importer: str, is_package: bool) -> Iterator[str]:
     """Full names of what a statement imports; a name taken out of a module counts as that module."""
     if isinstance(node, ast.Import):
-        yield from (alias.name for alias in node.names)
+        yield from (in_checkout(alias.name) for alias in node.names)
         return
     base = node.module or ""
     if node.level:
@@ -103,8 +109,8 @@ def targets(node: ast.Import | ast.ImportFrom, importer: str, is_package: bool) 
         above = parts[: len(parts) - node.level + is_package]
         base = ".".join([*above, base] if base else above)
     for alias in node.names:
-        inner = f"{base}.{alias.name}"
-        yield inner if inner in modules() else base
+        inner = in_checkout(f"{base}.{alias.name}")
+        yield inner if inner in modules() else in_checkout(base)
 
 
 @cache

@@ -87,15 +87,15 @@ def serve(
     Every stage is opened by a process of its own, which may read nothing but that stage and dies with its job.
     """
     with outcome("none"):
-        from service.limits import limits_from, table
+        from ..service.limits import limits_from, table
 
         chosen = limits_from(_numbers(limit or []))
         if limits:
             for row in table(chosen):
                 typer.echo(f"{row['name']:18} {row['value']:>12} {row['unit']:10} {row['meaning']}")
             return
-        from service.app import Settings
-        from service.serve import serve as run
+        from ..service.app import Settings
+        from ..service.serve import serve as run
 
         settings = Settings(
             stage_root=stage_root, data=data, executor=executor, queue=queue, tokens=_tokens(token_file), limits=chosen,
@@ -108,7 +108,7 @@ def _numbers(given: list[str]) -> dict[str, int | None]:
     """`NAME=NUMBER` pairs."""
     from dataclasses import fields
 
-    from service.limits import Limits
+    from ..service.limits import Limits
 
     known = [one.name for one in fields(Limits)]
     found: dict[str, int | None] = {}

@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdLux, UsdUtils
 
-import schemas
-
 from ..errors import StageError, UsageError
 from ..scene import F64, Mesh, Notice, Scene, Sphere
 from .camera import choose_camera, read_cameras
@@ -26,8 +24,10 @@ from .geometry.skel import posed
 from .geometry.traverse import Placement, some_of, walk
 from .layers.edit import words_of
 from .lights.read import read_lights
+from .ours import recognised
 from .probes.pictures import read_cubemap
 from .probes.read import read_probes
+from .registering import register
 
 Keep = Callable[[list[Placement], Tables], list[Placement]]
 """Some of what is drawn."""
@@ -44,7 +44,7 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
     Raises:
         StageError: the file is missing, unreadable, or not USD.
     """
-    schemas.register()
+    register()
     name = os.fspath(path)
     file = Path(name)
     if not file.exists():
@@ -69,6 +69,7 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
         for layer in stage.GetUsedLayers():  # USD keeps layers in memory; a changed file would show its old content
             if not layer.anonymous and not layer.dirty:
                 layer.Reload()
+        recognised(stage)
     return stage
 
 

@@ -21,6 +21,7 @@ from .geometry.skel import posed
 from .geometry.traverse import Placement, walk
 from .geometry.triangulate import turned_over, weld
 from .materials.read import THICKNESS_PRIMVAR, has_api, read_material
+from .ours import recognised
 from .stage import stage_unit, time_range
 
 SAME_SIZE = 1.0e-3
@@ -142,7 +143,7 @@ def find(stage: Usd.Stage) -> Found:
 
 def stage_of(layer: Sdf.Layer) -> Usd.Stage:
     """The stage whose root a layer is."""
-    return Usd.Stage.Open(layer)
+    return recognised(Usd.Stage.Open(layer))
 
 
 def _merged(group: list[Candidate]) -> Candidate:

@@ -12,6 +12,7 @@ from ...scene import Notice
 from ..layers.edit import outer_of, words_of
 from ..layers.write import RECORD, overlay
 from ..materials.read import API
+from ..ours import recognised
 from ..stage import open_stage, stage_unit, time_range
 
 MADE = "convert"
@@ -59,7 +60,7 @@ def begin(path: str, *, flatten: bool) -> Work:
     if flatten:
         layer, lost = _flat(stage)
         notices += [Notice(path, f"USD says: {text}") for text in lost]
-        stage = Usd.Stage.Open(layer)
+        stage = recognised(Usd.Stage.Open(layer))
     else:
         layer = overlay(path, made=MADE)
     layer.customLayerData = {**layer.customLayerData, RECORD: origin(path)}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdSkel
 
 from ...scene import Notice
+from ..ours import recognised
 
 _NESTED_INSTANCES = 64
 _CHANNELS = ("translations", "rotations", "scales", "blendShapeWeights")
@@ -34,7 +35,7 @@ def _copy(stage: Usd.Stage) -> Usd.Stage:
     """The same layers under a session layer of our own; what is skinned is no instance there, to have its own pose."""
     session = Sdf.Layer.CreateAnonymous("posed.usda")
     session.subLayerPaths.append(stage.GetSessionLayer().identifier)
-    copy = Usd.Stage.OpenMasked(stage.GetRootLayer(), session, stage.GetPopulationMask())
+    copy = recognised(Usd.Stage.OpenMasked(stage.GetRootLayer(), session, stage.GetPopulationMask()))
     copy.MuteAndUnmuteLayers(stage.GetMutedLayers(), [])
     copy.SetLoadRules(stage.GetLoadRules())
     copy.SetEditTarget(session)

@@ -12,11 +12,12 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from ...scene import F64, Notice, Probe, Volume
+from ..ours import PROBE as API
+from ..ours import applied, collection
 from .pictures import ReadCubemap, picture_of, refuse_picture
 from .values import INF, ProbePrim, fallback, flag, forced, numbers, positive, token
 from .volumes import Frame, Place, frame_of, own_volume, proxy_of, triple
 
-API = "RefractProbeAPI"
 PLANAR = "RefractPlanarProbe"
 MODES = ("baked", "realtime", "custom")
 RESOLUTION = (8, 4096)
@@ -50,7 +51,7 @@ def read_probes(
     transforms = UsdGeom.XformCache(time)
     found = []
     for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
-        if not prim.HasAPI(API):
+        if API not in applied(prim):
             continue
         source = ProbePrim(prim, time, notices)
         frame = frame_of(source, place, transforms) if _is_served(source) else None
@@ -188,15 +189,13 @@ def _distance_roughness(source: ProbePrim, planar: bool) -> bool:
 def _captured(source: ProbePrim) -> tuple[str, ...] | None:
     """Paths of the drawable prims in the collection; None where nothing is left out."""
     stage = source.prim.GetStage()
-    collection = Usd.CollectionAPI(source.prim, "captured")
-    relationships = (collection.GetIncludesRel(), collection.GetExcludesRel())
-    for target in (target for relationship in relationships for target in relationship.GetTargets()):
+    captured = collection(source.prim, "captured")
+    for target in captured.targets:
         if not stage.GetObjectAtPath(target):
             source.say(f"its collection 'captured' names {target}, which does not exist; correct or remove the target")
-    query = collection.ComputeMembershipQuery()
-    rules = query.GetAsPathExpansionRuleMap()
+    rules = captured.query.GetAsPathExpansionRuleMap()
     if rules and set(rules.values()) == {Usd.Tokens.expandPrims} and any(path.IsAbsoluteRootPath() for path in rules):
         return None
-    included = Usd.CollectionAPI.ComputeIncludedPaths(query, stage, Usd.TraverseInstanceProxies())
+    included = Usd.CollectionAPI.ComputeIncludedPaths(captured.query, stage, Usd.TraverseInstanceProxies())
     drawn = (UsdGeom.Gprim, UsdGeom.PointInstancer)
     return tuple(str(path) for path in included if any(stage.GetPrimAtPath(path).IsA(kind) for kind in drawn))

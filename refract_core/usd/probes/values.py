@@ -11,6 +11,7 @@ from pxr import Usd
 
 from ...errors import StageError
 from ...scene import Notice
+from .. import ours
 
 INF = math.inf
 
@@ -32,12 +33,12 @@ class ProbePrim:
 
     def get(self, name: str) -> Any:
         """What USD has for an attribute; None where that is nothing."""
-        return self.prim.GetAttribute(name).Get(self.time)
+        return ours.value(self.prim, name, self.time)
 
 
 def fallback(probe: ProbePrim, name: str) -> tuple[float, ...]:
     """What the schema says where nothing is authored."""
-    return floats(probe.prim.GetPrimDefinition().GetAttributeFallbackValue(name)) or ()
+    return floats(ours.fallback(probe.prim, name)) or ()
 
 
 def floats(value: Any) -> tuple[float, ...] | None:

@@ -16,6 +16,7 @@ from ...settings import RenderSettings
 from ..geometry.parts import Bound, Tables, bind
 from ..geometry.traverse import Placement
 from ..materials.read import read_material
+from ..ours import applied
 from ..settings import read_settings
 from ..stage import open_stage, scene_from_stage, stage_unit, time_range
 from .glass import Glass, glass_findings, glass_of
@@ -166,7 +167,7 @@ def _is_plain(material: UsdShade.Material) -> bool:
 
 def _has_api(stage: Usd.Stage, path: str) -> bool:
     prim = stage.GetPrimAtPath(path)
-    return bool(prim) and prim.HasAPI(API)
+    return bool(prim) and API in applied(prim)
 
 
 def _is_typed(stage: Usd.Stage, path: str) -> bool:

@@ -18,8 +18,7 @@ from typing import Any
 
 from pxr import Plug, Sdf, Usd
 
-import schemas
-
+from ..registering import FOLDER
 from .stage import PLUGIN, scene_findings
 from .values import ERROR, WARNING, Finding, values_of_prim
 
@@ -30,7 +29,7 @@ def register() -> None:
     """Make the validators known to USD. May be called any number of times."""
     from pxr import UsdValidation
 
-    folder = schemas.FOLDER / "validators"
+    folder = FOLDER / "validators"
     Plug.Registry().RegisterPlugins(str(folder))
     registry = UsdValidation.ValidationRegistry()
     if not hasattr(registry, "RegisterPluginPrimValidator") or registry.HasValidator(VALUES):

@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 
 from pxr import Sdf, Usd, UsdShade
 
-import schemas
-
+from .. import ours
 from ..materials.read import THIN_THICKNESS
 from ..stage import stage_unit
 
@@ -90,17 +89,16 @@ class _Field(NamedTuple):
 
 def _fields() -> dict[str, tuple[_Field, ...]]:
     """Attributes with tokens or numbers, by API schema."""
-    registry, found = Usd.SchemaRegistry(), {}
-    for api in schemas.APPLIED:
-        definition = registry.FindAppliedAPIPrimDefinition(api)
+    found = {}
+    for api in ours.APPLIED:
         rows = []
-        for name in definition.GetPropertyNames():
-            value = definition.GetAttributeFallbackValue(name)
+        for spec in ours.attributes(api):
+            name, value = spec.name, spec.default
             if name.startswith("collection:") or value is None or isinstance(value, (bool, Sdf.AssetPath)):
                 continue
-            hard = dict(definition.GetPropertyMetadata(name, "limits") or {}).get("hard", {})
+            hard = dict(spec.GetInfo("limits") or {}).get("hard", {})
             low, high = (_numbers(hard[end]) if end in hard else () for end in ("minimum", "maximum"))
-            tokens = tuple(map(str, definition.GetPropertyMetadata(name, _ALLOWED) or ()))
+            tokens = tuple(map(str, spec.GetInfo(_ALLOWED) or ()))
             rows.append(_Field(str(name), tokens, low or (), high or (), value))
         found[api] = tuple(rows)
     return found
@@ -110,7 +108,7 @@ def value_findings(stage: Usd.Stage) -> list[Finding]:
     """What is wrong with the values of our attributes, on all prims of a stage and at all their times."""
     fields, found = _fields(), []
     for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
-        if applied := [api for api in prim.GetAppliedSchemas() if api in fields]:
+        if applied := ours.applied(prim):
             found += _of_prim(prim, [field for api in applied for field in fields[api]])
     return found
 
@@ -118,7 +116,7 @@ def value_findings(stage: Usd.Stage) -> list[Finding]:
 def values_of_prim(prim: Usd.Prim) -> list[Finding]:
     """The same for one prim."""
     fields = _fields()
-    return _of_prim(prim, [field for api in prim.GetAppliedSchemas() if api in fields for field in fields[api]])
+    return _of_prim(prim, [field for api in ours.applied(prim) for field in fields[api]])
 
 
 def _of_prim(prim: Usd.Prim, fields: Sequence[_Field]) -> list[Finding]:
@@ -258,9 +256,10 @@ def _of_thin(prim: Usd.Prim) -> Iterator[Finding]:
 
 def fallback_findings(stage: Usd.Stage) -> list[Finding]:
     """A stage with our prim types that does not say what other programs are to take them for."""
-    known = stage.GetMetadata("fallbackPrimTypes") or {}
+    root = stage.GetRootLayer().pseudoRoot
+    known = root.GetInfo("fallbackPrimTypes") if root.HasInfo("fallbackPrimTypes") else {}
     everything = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
-    used = {str(name) for name in {prim.GetTypeName() for prim in everything} if name in schemas.TYPED}
+    used = {str(name) for name in {prim.GetTypeName() for prim in everything} if name in ours.TYPED}
     if used <= set(known):
         return []
     text = "fallbackPrimTypes is not authored: where our schema is not installed, probes lose their transform"
@@ -278,11 +277,11 @@ def readable(stage: Usd.Stage, findings: Iterable[Finding]) -> Usd.Stage:
     session = Sdf.Layer.CreateAnonymous("known_tokens.usda")
     if stage.GetSessionLayer():
         session.subLayerPaths.append(stage.GetSessionLayer().identifier)
-    other = Usd.Stage.Open(stage.GetRootLayer(), session, stage.GetPathResolverContext())
+    other = ours.recognised(Usd.Stage.Open(stage.GetRootLayer(), session, stage.GetPathResolverContext()))
     other.SetEditTarget(session)
     for finding in wrong:
         prim = other.GetPrimAtPath(finding.path)
-        value = prim.GetPrimDefinition().GetAttributeFallbackValue(finding.about)
+        value = ours.fallback(prim, finding.about)
         if value is not None and not prim.IsInstanceProxy():
             prim.GetAttribute(finding.about).Set(value)
     return other
@@ -294,7 +293,7 @@ def apply_repairs(layer: Sdf.Layer, repairs: Iterable[Repair]) -> None:
     stage.SetEditTarget(layer)
     for repair in repairs:
         if repair.path == "/":
-            stage.WriteFallbackPrimTypes()
+            ours.write_fallback_types(stage)
             continue
         attribute = stage.GetPrimAtPath(repair.path).GetAttribute(repair.name)
         for time, value in repair.values:
