@@ -15,6 +15,8 @@ TYPED = ("RefractProbe", "RefractPlanarProbe")
 def register() -> None:
     """Make the schemas known to USD. May be called any number of times; must be called before any stage is opened.
 
+    `import refract_core` registers too, as soon as USD is loaded; this call is for those who want to be told that it is
+    too late.
     USD reads its table of schemas once, when a stage is first opened or made. This call reads it too, to be sure, so
     other packages that bring schemas have to be imported before it.
 

@@ -23,7 +23,7 @@ from service.metrics import Metrics
 from service.models import Convert, Override, Render
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "usd_samples").rglob("*.md"))]
+PAGES = [page for part in ("*.md", "docs/**/*.md", "usd_samples/**/*.md") for page in sorted(ROOT.glob(part))]
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 # What a page may ask a reader to type that `.ci/run`, the benchmarks or a fixture do, not these tests.
 _ELSEWHERE = (
