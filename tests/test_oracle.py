@@ -18,10 +18,10 @@ import pytest
 from numpy.typing import NDArray
 from oracle import Oracle, Pixel
 from random_scenes import random_scene
-from scenes import camera, light, material, quad, scene
+from scenes import camera, light, material, quad, scene, turned
 
 import refract_core as rc
-from refract_core.scene import Channel, LightKind, Param, Scene, Source, Wrap
+from refract_core.scene import Channel, LightKind, Material, Param, Probe, Scene, Source, Volume, Wrap
 
 F32 = NDArray[np.float32]
 
@@ -95,6 +95,31 @@ def compare(what: Scene, settings: rc.RenderSettings, width: int, height: int) -
 @pytest.mark.parametrize("seed", range(SCENES))
 def test_the_engine_draws_what_the_oracle_sees(seed: int) -> None:
     wrong, excused = compare(random_scene(seed), settings_of(seed), WIDTH, HEIGHT)
+    assert not wrong, f"{len(wrong)} differences, among them\n" + "\n".join(wrong[:12])
+    assert excused <= WIDTH * HEIGHT / 50
+
+
+def polished(m: Material) -> Material:
+    """The same, but smooth if it is glass."""
+    inputs = list(m.inputs)
+    inputs[Param.ROUGHNESS] = Source((0.0,) * 4)
+    return replace(m, inputs=tuple(inputs)) if m.refractive else m
+
+
+@pytest.mark.parametrize("seed", range(100, 108))
+def test_the_screen_by_proxy_is_what_the_oracle_finds_there(seed: int) -> None:
+    """Smooth glass, one layer: place on the proxy, reprojection, foreground rule, edge fade, confidence. Reflections
+    are marched for, so beauty and reflection are compared on opaque pixels only."""
+    what = random_scene(seed)
+    turn = np.eye(4)
+    turn[:3, :3], turn[:3, 3] = turned((1, 2, 3), 10.0 * seed), (0.05, 0.1, -0.2)
+    everywhere = Volume(np.eye(4), False, (1e3, 1e3, 1e3))
+    proxy = [Volume(turn, False, (2.0, 1.3, 1.8)), Volume(turn, True, (1.7, 1.7, 1.7)), None][seed % 3]
+    probe = Probe("/probe", "realtime", (0.0, 0.0, 0.0), everywhere, proxy)
+    what = replace(what, materials=tuple(polished(m) for m in what.materials), probes=(probe,))
+    settings = replace(settings_of(0), tiers=("screen", "ray", "sky"), screen="proxy", max_layers=1)
+    assert rc.render(what, settings).planes["weight.screen"].max() > 0.1
+    wrong, excused = compare(what, settings, WIDTH, HEIGHT)
     assert not wrong, f"{len(wrong)} differences, among them\n" + "\n".join(wrong[:12])
     assert excused <= WIDTH * HEIGHT / 50
 

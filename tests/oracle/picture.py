@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -10,10 +11,11 @@ from refract_core.scene import Camera, Param, Scene
 from refract_core.settings import RenderSettings
 
 from . import optics, sampling
+from .screen import NOTHING, Found, by_proxy
 from .shading import Shader, View, diffuse, ray_bits
 from .surface import Surface, number, surface_at
 from .tiers import Answer, Leaf, ask
-from .vec import ZERO, Vec, add, at, clamp, dot, mul, scaled, unit, vec
+from .vec import ZERO, Vec, add, at, clamp, dot, mul, scaled, sub, unit, vec
 from .walk import Entry, Exit, Status, entry_at, exit_of
 from .world import GLASS, OPAQUE, Hit, all_present, first
 
@@ -70,6 +72,11 @@ class Oracle:
         across = (self.window[1] - self.window[0]) / width
         self.spread = 0.0 if self.camera.orthographic else across
         """how much wider a pixel's cone gets per metre"""
+        self.marches = "screen" in settings.tiers
+        """What is mirrored is marched for, which is not known here: planes that hold reflections are left out."""
+        if self.marches and (settings.screen != "proxy" or settings.max_layers > 1 or len(scene.probes) != 1):
+            raise NotImplementedError("the screen is known by proxy, with one layer and one probe that lends its proxy")
+        self._seen: dict[tuple[int, int, int], tuple[Vec, float]] = {}
 
     def pixel(self, x: int, y: int, nudge: tuple[float, float] = (0.0, 0.0)) -> Pixel:
         """`nudge`: look beside the sample, by so many pixels, with the very same random numbers."""
@@ -77,7 +84,10 @@ class Oracle:
         sums = _Sums()
         for k in range(self.settings.samples):
             self._add_sample(sums, x, y, k, nudge)
-        return Pixel(self._finished(sums, x, y), self.shader.unsure)
+        planes = self._finished(sums, x, y)
+        if self.marches and planes["mask"][0] > 0.0:
+            del planes["beauty"], planes["reflection"]
+        return Pixel(planes, self.shader.unsure)
 
     # --- The camera ---
 
@@ -97,11 +107,7 @@ class Oracle:
     # --- One sample ---
 
     def _add_sample(self, sums: _Sums, x: int, y: int, k: int, nudge: tuple[float, float]) -> None:
-        jx, jy = sampling.jitter(k)
-        px, py = x + 0.5 + jx, y + 0.5 + jy
-        straight = self.ray(px, py)
-        view = View((x, y, 0), k, ray_bits(straight.origin, straight.direction))
-        ray = self.ray(px + nudge[0], py + nudge[1])
+        ray, view = self._through(x, y, k, nudge)
         opaque = self._first_opaque(ray, view)
         entries = self._entries(ray, view, ray.far if opaque is None else opaque.t)
         alpha, color, z, n = self._backdrop(ray, view, opaque)
@@ -116,6 +122,13 @@ class Oracle:
             sums.keep("layers", [float(len(layers))])
             sums.keep("Z", [z])
             sums.keep("N", list(n))
+
+    def _through(self, x: int, y: int, k: int, nudge: tuple[float, float] = (0.0, 0.0)) -> tuple[Ray, View]:
+        jx, jy = sampling.jitter(k)
+        px, py = x + 0.5 + jx, y + 0.5 + jy
+        straight = self.ray(px, py)
+        view = View((x, y, 0), k, ray_bits(straight.origin, straight.direction))
+        return self.ray(px + nudge[0], py + nudge[1]), view
 
     def _first_opaque(self, ray: Ray, view: View) -> Hit | None:
         hits = self.shader.world.candidates(ray.origin, ray.direction, ray.near, ray.far, OPAQUE)
@@ -154,7 +167,7 @@ class Oracle:
             s = s._replace(ns=s.ng)
         gathered = self.shader.gather(s, view.key, view.sample)
         entry = entry_at(self.scene, hit, self.settings.model)
-        through, exit_, answer = self._transmitted(s, entry, view)
+        through, exit_, answer = self._transmitted(s, entry, view, hit.t * ray.cosine)
         share = optics.fresnel(clamp(dot(s.ns, s.wo)), entry.medium.ior)
         m = self.scene.materials[hit.face.material]
         opacity = clamp(number(self.scene, hit, m, Param.OPACITY))
@@ -164,7 +177,7 @@ class Oracle:
         color = add(add(refraction, reflection), scaled(diffuse(s, gathered), opacity))
         return Layer(color, 1.0 - answer.none * clear, refraction, reflection, s, entry, exit_, answer)
 
-    def _transmitted(self, s: Surface, entry: Entry, view: View) -> tuple[Vec, Exit, Answer]:
+    def _transmitted(self, s: Surface, entry: Entry, view: View, z: float) -> tuple[Vec, Exit, Answer]:
         """Light from behind, channel by channel under dispersion; the green ray stands for all in the data planes."""
         indices = optics.iors(entry.medium.ior, entry.abbe)
         hdrp = self.settings.screen == "proxy"
@@ -175,7 +188,7 @@ class Oracle:
             seen_as = s.roughness if hdrp else rough
             embedded = exit_.status is Status.EMBEDDED
             leaf = Leaf(exit_.point, exit_.direction, _tangent(rough), seen_as, embedded)
-            found[ior] = exit_, ask(self.shader, leaf, self.settings.tiers, view)
+            found[ior] = exit_, ask(self.shader, leaf, self.settings.tiers, view, self._on_screen(leaf, view, z))
         light = [mul(found[ior][1].color, found[ior][0].transmittance)[c] for c, ior in enumerate(indices)]
         return vec(light), *found[indices[1]]
 
@@ -183,14 +196,50 @@ class Oracle:
         r = optics.mirrored(scaled(s.wo, -1.0), s.ns)
         if dot(r, s.ng) <= 0.0:
             r = optics.mirrored(scaled(s.wo, -1.0), s.ng)
-        return ask(self.shader, Leaf(s.point, r, _tangent(s.roughness), s.roughness), self.settings.tiers, view)
+        tiers = tuple(tier for tier in self.settings.tiers if tier != "screen")
+        leaf = Leaf(s.point, r, _tangent(s.roughness), s.roughness)
+        return ask(self.shader, leaf, tiers, view, lambda: NOTHING)
+
+    # --- The screen ---
+
+    def _on_screen(self, leaf: Leaf, view: View, z: float) -> Callable[[], Found]:
+        """By the proxy of the scene's probe."""
+
+        def look(column: int, row: int) -> tuple[Vec, float]:
+            return self._opaque_at(column, row, view.sample)
+
+        own = (view.key[0] + 0.5, view.key[1] + 0.5, z)
+        return lambda: by_proxy(
+            leaf.origin, leaf.direction, self.scene.probes[0].proxy, self.size, own, look,
+            lambda p: self._project(p, view.sample),
+        )  # fmt: skip
+
+    def _opaque_at(self, x: int, y: int, k: int) -> tuple[Vec, float]:
+        """Colour and depth of the picture without its glass."""
+        if (x, y, k) not in self._seen:
+            ray, view = self._through(x, y, k)
+            _, color, z, _ = self._backdrop(ray, view, self._first_opaque(ray, view))
+            self._seen[x, y, k] = color, z
+        return self._seen[x, y, k]
+
+    def _project(self, p: Vec, k: int) -> tuple[float, float, float]:
+        """Pixel coordinates in the window of a sample, and depth."""
+        v = sub(p, self.eye)
+        z = dot(v, self.forward)
+        w = 1.0 if self.camera.orthographic else z
+        left, right, bottom, top = self.window
+        jx, jy = sampling.jitter(k)
+        px = (dot(v, self.right) / w - left) / (right - left) * self.size[0]
+        py = (top - dot(v, self.up) / w) / (top - bottom) * self.size[1]
+        return px - jx, py - jy, z
 
     # --- Planes ---
 
     def _note_glass(self, sums: _Sums, front: Layer, k: int) -> None:
         answer, exit_ = front.answer, front.exit
         sums.add("mask", [1.0])
-        for name, w in zip(_WEIGHTS, (0.0, answer.ray, 0.0, answer.sky, answer.none), strict=True):
+        shares = (answer.screen, answer.ray, 0.0, answer.sky, answer.none)
+        for name, w in zip(_WEIGHTS, shares, strict=True):
             sums.add(f"weight.{name}", [w])
         sums.add("refraction", list(front.refraction))
         sums.add("reflection", list(front.reflection))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 from . import sampling
 from .optics import scattered
+from .screen import NOTHING, Found
 from .shading import Shader, View
-from .vec import ZERO, Vec
+from .vec import ZERO, Vec, add, scaled
 from .world import OPAQUE
 
 
@@ -24,26 +26,42 @@ class Leaf(NamedTuple):
 
 
 class Answer(NamedTuple):
+    """Colour, the share each tier gave of it, and the share that nobody knew."""
+
     color: Vec
+    screen: float
     ray: float
     sky: float
     none: float
     confidence: float
 
 
-def ask(shader: Shader, leaf: Leaf, order: tuple[str, ...], view: View) -> Answer:
+def ask(shader: Shader, leaf: Leaf, order: tuple[str, ...], view: View, on_screen: Callable[[], Found]) -> Answer:
     """`ray` meets the opaque scene, `sky` is the environment. What lies inside the glass is always asked by ray."""
+    color, left, confidence = ZERO, 1.0, 0.0
+    shares = {"screen": 0.0, "ray": 0.0, "sky": 0.0}
     for tier in ("ray", *order) if leaf.embedded else order:
-        if tier == "ray":
-            color = _by_ray(shader, leaf, view)
-            if color is not None:
-                return Answer(color, 1.0, 0.0, 0.0, 1.0)
-        elif tier == "sky":
-            if shader.sky is not None:
-                return Answer(shader.sky.lobe(leaf.direction, leaf.roughness), 0.0, 1.0, 0.0, 1.0)
-        else:
-            raise NotImplementedError(f"the oracle knows no tier '{tier}'")
-    return Answer(ZERO, 0.0, 0.0, 1.0, 0.0)
+        if left <= 1e-6:
+            break
+        found = _answer(shader, leaf, tier, view, on_screen)
+        weight = min(found.weight, left)
+        color = add(color, scaled(found.color, weight))
+        confidence += weight * found.confidence
+        shares[tier] += weight
+        left -= weight
+    return Answer(color, shares["screen"], shares["ray"], shares["sky"], left, confidence)
+
+
+def _answer(shader: Shader, leaf: Leaf, tier: str, view: View, on_screen: Callable[[], Found]) -> Found:
+    if tier == "ray":
+        light = _by_ray(shader, leaf, view)
+        return NOTHING if light is None else Found(light, 1.0, 1.0)
+    if tier == "sky":
+        known = shader.sky
+        return NOTHING if known is None else Found(known.lobe(leaf.direction, leaf.roughness), 1.0, 1.0)
+    if tier == "screen":
+        return on_screen()
+    raise NotImplementedError(f"the oracle knows no tier '{tier}'")
 
 
 def _by_ray(shader: Shader, leaf: Leaf, view: View) -> Vec | None:
