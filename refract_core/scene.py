@@ -13,20 +13,12 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from .models import Model as Model
+
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 U32 = NDArray[np.uint32]
-
-
-class Model(IntEnum):
-    """How a material bends light. The order is the value kernels see."""
-
-    NONE = 0
-    SPHERE = 1
-    BOX = 2
-    THIN = 3
-    TRACED = 4
 
 
 class Channel(IntEnum):

@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass
 
 from .errors import UsageError
+from .models import MODELS as MODELS
 
 TIERS = ("screen", "ray", "probe", "sky")
 SCREEN_METHODS = ("march", "proxy")
-MODELS = ("none", "sphere", "box", "thin", "traced")
 PURPOSES = ("default", "render", "proxy", "guide")
 MAX_PIXELS = 1 << 28
 

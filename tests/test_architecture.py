@@ -37,7 +37,7 @@ ROOMS = {
 }
 
 # The wings of the engine from the ground up: each may use those before it, and the records every wing speaks of.
-RECORDS = ("errors", "files", "progress", "scene", "settings", "version")
+RECORDS = ("errors", "files", "models", "progress", "scene", "settings", "version")
 WINGS = (
     "kernels", "optics", "images", "world", "probes", "view", "transport", "rendering", "thickness", "usd", "verbs",
     "cli",

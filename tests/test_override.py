@@ -18,7 +18,7 @@ from refract_core.cli import app
 from refract_core.progress import reporting
 from refract_core.scene import Model, Param, Source, Sphere
 from refract_core.verbs.executors import Crew
-from refract_core.verbs.override import FIELDS, LENGTHS, RANGES, THIN_THICKNESS, OverrideError, override_notes
+from refract_core.verbs.override import FIELDS, LENGTHS, RANGES, OverrideError, override_notes
 from refract_core.verbs.render_files import Order, render_files
 
 SMALL = {"image_width": 32, "samples": 1, "jobs": 1}
@@ -117,9 +117,8 @@ def test_what_becomes_glass_is_clear_and_what_becomes_thin_is_thin() -> None:
     matt, _ = rc.override(scene(), {"/box": {"model": "traced"}}).materials
     assert (matt.model, value(matt, Param.OPACITY)) == (Model.TRACED, (0, 0, 0))
     _, thin = rc.override(scene(), {"/ball": {"model": "thin", "thickness": 9, "absorptionDistance": 9}}).materials
-    assert value(thin, Param.THICKNESS) == (THIN_THICKNESS,) * 3
-    assert thin.absorption_distance == THIN_THICKNESS
-    assert importlib.import_module("refract_core.usd.materials.read").THIN_THICKNESS == THIN_THICKNESS
+    assert value(thin, Param.THICKNESS) == (Model.THIN.fixed_thickness,) * 3
+    assert thin.absorption_distance == Model.THIN.fixed_thickness
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdRender, UsdShade
 
 import schemas
 from refract_core.errors import UsageError
+from refract_core.models import DEFAULT, explained
 from refract_core.settings import MODELS, TIERS, RenderSettings
 from schemas import FOLDER
 from schemas.generate import generate
@@ -37,7 +38,7 @@ class Attribute(NamedTuple):
 MATERIAL, PROBE, SETTINGS = "RefractMaterialAPI", "RefractProbeAPI", "RefractSettingsAPI"
 ZEROS, ONES = (0.0,) * 6, (1.0,) * 6
 TABLE = (
-    Attribute(MATERIAL, "refraction:model", "token", "sphere", MODELS, uniform=True),
+    Attribute(MATERIAL, "refraction:model", "token", DEFAULT.token, MODELS, uniform=True),
     Attribute(MATERIAL, "inputs:refraction:ior", "float", 1.5, minimum=1.0),
     Attribute(MATERIAL, "inputs:refraction:thickness", "float", 1.0, minimum=0.0),
     Attribute(MATERIAL, "inputs:refraction:thicknessMultiplier", "float", 1.0, minimum=0.0),
@@ -130,6 +131,11 @@ def test_the_table_above_lists_every_property(schema: str) -> None:
     listed = {row.name for row in TABLE if row.schema == schema}
     assert set(definition.GetPropertyNames()) - collection - {"probe:proxy:prim"} == listed - collection
     assert definition.GetDocumentation()
+
+
+def test_the_schema_explains_every_model_as_the_engine_does(stage: Usd.Stage) -> None:
+    text = attribute_of(stage, TABLE[0]).GetDocumentation()
+    assert f"Range: {explained()}." in " ".join(text.split())
 
 
 @pytest.mark.parametrize("name", schemas.TYPED)

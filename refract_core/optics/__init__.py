@@ -2,4 +2,4 @@
 Knows no scene.
 """
 
-__all__ = ["arrays", "interface", "lobes"]
+__all__ = ["arrays", "interface", "lobes", "models"]

@@ -16,7 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import UsageError
 from ..kernels.compile import inlined, kernel
 from ..kernels.vec import Vec
+from ..models import Model
 from . import interface as one
+from . import models
 
 F64 = NDArray[np.float64]
 
@@ -113,7 +115,7 @@ def box_model(position: ArrayLike, normal: ArrayLike, wo: ArrayLike, ior: ArrayL
 
 def thin_model(position: ArrayLike, normal: ArrayLike, wo: ArrayLike, ior: ArrayLike) -> Exit:
     """Through a slab of 5 mm, whatever thickness is authored."""
-    return box_model(position, normal, wo, ior, one.THIN_THICKNESS)
+    return box_model(position, normal, wo, ior, Model.THIN.fixed_thickness)
 
 
 def refract_node(
@@ -201,7 +203,7 @@ def _transmittance(rows: F64, out: F64) -> None:
 @kernel
 def _sphere_model(rows: F64, out: F64) -> None:
     for i in range(rows.shape[0]):
-        path_length, point, direction = one.sphere_model(
+        path_length, point, direction = models.sphere_model(
             _get(rows, i, 0), _get(rows, i, 3), _get(rows, i, 6), rows[i, 9], rows[i, 10]
         )
         out[i, 0] = path_length
@@ -212,7 +214,7 @@ def _sphere_model(rows: F64, out: F64) -> None:
 @kernel
 def _box_model(rows: F64, out: F64) -> None:
     for i in range(rows.shape[0]):
-        path_length, point, direction = one.box_model(
+        path_length, point, direction = models.box_model(
             _get(rows, i, 0), _get(rows, i, 3), _get(rows, i, 6), rows[i, 9], rows[i, 10]
         )
         out[i, 0] = path_length

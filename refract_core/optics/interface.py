@@ -11,14 +11,10 @@ from __future__ import annotations
 import math
 
 from ..kernels.compile import inlined
-from ..kernels.vec import Vec, along, dot, flip_towards, normalize, scale
+from ..kernels.vec import Vec, along, dot, scale
 
-THIN_THICKNESS = 0.005
-"""Thickness, and absorption distance, of every thin surface [m] (HDRP, REFRACTION_THIN_DISTANCE)."""
 LOG_EPSILON = 2.0**-24
 """Keeps the logarithm of a black transmittance colour finite (HDRP, VolumeRendering.hlsl)."""
-BOX_MIN_COS = 1e-5
-"""Floor of the cosine in the box model (HDRP, Refraction.hlsl)."""
 PROBE_LAST_LOD = 6.0
 """Last GGX level of a probe's mip chain (HDRP, ImageBasedLighting.hlsl)."""
 
@@ -103,56 +99,6 @@ def transmittance(color: Vec, absorption_distance: float, path_length: float) ->
 @inlined
 def _attenuate(color: float, distances: float) -> float:
     return min(math.exp(distances * math.log(max(color, 0.0) + LOG_EPSILON)), 1.0)
-
-
-@inlined
-def _enter(n: Vec, wo: Vec, ior: float) -> tuple[Vec, Vec, float, float, float]:
-    """First interface of every model: normal towards the viewer, direction inside, cos_i, cos_t and the ior >= 1."""
-    dense = max(ior, 1.0)
-    facing = flip_towards(n, wo)
-    cos_i = min(dot(facing, wo), 1.0)
-    cos_t = math.sqrt(max(1.0 - (1.0 - cos_i * cos_i) / (dense * dense), 0.0))
-    inside = along(scale(wo, -1.0 / dense), facing, cos_i / dense - cos_t)
-    return facing, inside, cos_i, cos_t, dense
-
-
-@inlined
-def sphere_model(p: Vec, n: Vec, wo: Vec, ior: float, thickness: float) -> tuple[float, Vec, Vec]:
-    """Through a ball of diameter `thickness` that touches the surface from inside (HDRP, Refraction.hlsl).
-
-    The ball's far normal is n + 2 cos_t r, whatever its size, and the ray leaves it under the angle it came in
-    with; written so, neither a thickness of 0 nor rounding at grazing angles can break the second refraction.
-
-    Returns:
-        Path length inside [m], exit point [m], unit exit direction.
-    """
-    facing, inside, cos_i, cos_t, dense = _enter(n, wo, ior)
-    path_length = thickness * cos_t
-    outward = along(facing, inside, 2.0 * cos_t)
-    leaving = along(scale(inside, dense), outward, cos_i - dense * cos_t)
-    return path_length, along(p, inside, path_length), normalize(leaving)
-
-
-@inlined
-def box_model(p: Vec, n: Vec, wo: Vec, ior: float, thickness: float) -> tuple[float, Vec, Vec]:
-    """Through a slab of `thickness` with parallel faces: shifted, not turned (HDRP, Refraction.hlsl).
-
-    Returns:
-        Path length inside [m], exit point [m], unit exit direction (-wo).
-    """
-    _, inside, _, cos_t, _ = _enter(n, wo, ior)
-    path_length = thickness / max(cos_t, BOX_MIN_COS)
-    return path_length, along(p, inside, path_length), scale(wo, -1.0)
-
-
-@inlined
-def thin_model(p: Vec, n: Vec, wo: Vec, ior: float) -> tuple[float, Vec, Vec]:
-    """The box model at `THIN_THICKNESS`. Its absorption distance is `THIN_THICKNESS` too (HDRP, Lit.hlsl).
-
-    Returns:
-        Path length inside [m], exit point [m], unit exit direction (-wo).
-    """
-    return box_model(p, n, wo, ior, THIN_THICKNESS)
 
 
 @inlined

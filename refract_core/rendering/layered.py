@@ -9,7 +9,8 @@ import numpy as np
 
 from ..kernels.lanes import scratch
 from ..kernels.pointer import Pointer
-from ..scene import Model, Scene
+from ..models import BY_TOKEN
+from ..scene import Scene
 from ..settings import TIERS, RenderSettings
 from ..transport.layers import LayerScratch, new_layer_result, put_tile, refract_tile
 from ..transport.tiers import Asking
@@ -38,7 +39,7 @@ class Layered:
         self.session, self.tiles, self.planes = session, tiles, planes
         self.order = np.array([TIERS.index(t) for t in settings.tiers], np.int32)
         self.by_proxy = settings.screen == "proxy"
-        self.model = int(Model[settings.model.upper()]) if settings.model else -1
+        self.model = int(BY_TOKEN[settings.model]) if settings.model else -1
         self.max_layers = settings.max_layers
         self.screen = new_screen_buffers(width, height, is_rough(scene))
         # The opaque layer is level 0 of the screen's pyramids.

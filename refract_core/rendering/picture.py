@@ -15,8 +15,9 @@ from ..images.frame import Frame
 from ..kernels.compile import is_compiled
 from ..kernels.pointer import Pointer
 from ..kernels.sampling import pixel_offset
+from ..models import BY_TOKEN, SHEET, Behind
 from ..progress import COMPILING
-from ..scene import Camera, Model, Notice, Scene
+from ..scene import Camera, Notice, Scene
 from ..settings import RenderSettings
 from ..transport.layers import refract_tile
 from ..version import __version__
@@ -79,9 +80,14 @@ def render(
 
 def open_meshes(scene: Scene, model: str) -> tuple[Notice, ...]:
     """Say which meshes were to be traced but have no inside to trace through."""
-    text = "the mesh is open, so 'traced' finds no far side; drawn as 'thin'. Close the mesh, or set another model"
-    traced = np.array([m.refractive and (m.model is Model.TRACED or model == "traced") for m in scene.materials], bool)
-    return tuple(Notice(m.path, text) for m in scene.meshes if not m.closed and traced[m.materials].any())
+    asked = [BY_TOKEN[model] if model else m.model for m in scene.materials]
+    walked = [m.refractive and to.behind is Behind.MESH for m, to in zip(scene.materials, asked, strict=True)]
+    found = []
+    for mesh in scene.meshes:
+        if not mesh.closed and (mine := {asked[k] for k in np.unique(mesh.materials).tolist() if walked[k]}):
+            what = f"the mesh is open, so '{min(mine).token}' finds no far side; drawn as '{SHEET.token}'"
+            found.append(Notice(mesh.path, f"{what}. Close the mesh, or set another model"))
+    return tuple(found)
 
 
 def _draw(

@@ -19,7 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene import F64, Model
+from ..models import Behind, Model, model_for
+from ..scene import F64
 
 SPHERE_RESIDUAL = 0.05
 """A ball: root mean square distance of the surface from the best sphere, against its radius."""
@@ -47,6 +48,9 @@ _RAYS = 256
 _TESTS = 4_000_000
 """Ray-triangle tests spent on one part."""
 
+_BALL, _BOX, _WALL, _ANY = map(model_for, (Behind.BALL, Behind.SLAB, Behind.SHEET, Behind.MESH))
+"""The models that suit."""
+
 Index = NDArray[np.int64]
 
 
@@ -72,9 +76,9 @@ def fit(points: F64, triangles: NDArray[np.integer]) -> Fit:
     """
     points, corners = _welded(np.asarray(points, np.float64), np.asarray(triangles, np.int64))
     if not len(corners):
-        return Fit(Model.THIN, 0.0, False, False, "no triangles")
+        return Fit(_WALL, 0.0, False, False, "no triangles")
     if not _is_closed(corners):
-        return Fit(Model.THIN, _smallest_side(points[np.unique(corners)]), False, False, "open")
+        return Fit(_WALL, _smallest_side(points[np.unique(corners)]), False, False, "open")
     parts = _parts(corners, len(points))
     if len(parts) > _PARTS:
         parts = [parts[int(place)] for place in np.linspace(0, len(parts) - 1, _PARTS)]
@@ -82,7 +86,7 @@ def fit(points: F64, triangles: NDArray[np.integer]) -> Fit:
     largest = max(volumes, key=abs)
     if len(parts) > 1 and any(_inside(points, a, points, b) for a, b in _cavities(parts, volumes, largest)):
         side = _smallest_side(points[np.unique(corners)])
-        return Fit(Model.THIN, side, True, False, "hollow: a shell inside a shell")
+        return Fit(_WALL, side, True, False, "hollow: a shell inside a shell")
     return together([_fit_part(points, part) for part in parts])
 
 
@@ -98,8 +102,8 @@ def together(fits: Sequence[Fit]) -> Fit:
         why = whys[0] if len(whys) == 1 else f"{len(fits)} shapes, the worst of which: {_worst(fits)}"
         return Fit(fits[0].model, thickness, closed, convex, why)
     counts = {model: sum(one.model is model for one in fits) for model in sorted(models)}
-    named = ", ".join(f"{count} {model.name.lower()}" for model, count in counts.items())
-    return Fit(Model.TRACED, thickness, closed, convex, f"its shapes differ: {named}")
+    named = ", ".join(f"{count} {model.token}" for model, count in counts.items())
+    return Fit(_ANY, thickness, closed, convex, f"its shapes differ: {named}")
 
 
 def alike(thicknesses: Sequence[float]) -> bool:
@@ -212,22 +216,22 @@ def _surface(points: F64, corners: Index) -> _Surface:
 def _fit_part(points: F64, corners: Index) -> Fit:
     part = _surface(points, corners)
     if not len(part.corners):
-        return Fit(Model.THIN, 0.0, True, False, "closed, but without a volume")
+        return Fit(_WALL, 0.0, True, False, "closed, but without a volume")
     if _is_convex(part):
         diameter, round_off = _sphere(part)
         if round_off <= SPHERE_RESIDUAL:
-            return Fit(Model.SPHERE, diameter, True, True, f"closed, convex, a ball within {_percent(round_off)}")
+            return Fit(_BALL, diameter, True, True, f"closed, convex, a ball within {_percent(round_off)}")
         side, box_off = _box(part)
         if box_off <= BOX_RESIDUAL:
-            return Fit(Model.BOX, side, True, True, f"closed, convex, a box within {_percent(box_off)}")
+            return Fit(_BOX, side, True, True, f"closed, convex, a box within {_percent(box_off)}")
         off = f"ball {_percent(round_off)}, box {_percent(box_off)} off"
-        return Fit(Model.TRACED, side, True, True, f"closed, convex, neither a ball nor a box ({off})")
+        return Fit(_ANY, side, True, True, f"closed, convex, neither a ball nor a box ({off})")
     side, _ = _box(part)
     wall, share = _walls(part)
     sheet = 2.0 * _volume(part.points, part.corners) / float(part.areas.sum()) >= SHEET * wall
     if (wall <= SHEET_WALL * side and sheet) or (wall <= CAVITY_WALL * side and share >= CAVITY_SHARE):
-        return Fit(Model.THIN, side, True, False, f"hollow: walls of {_percent(wall / side)} of its smallest side")
-    return Fit(Model.TRACED, side, True, False, "closed, not convex")
+        return Fit(_WALL, side, True, False, f"hollow: walls of {_percent(wall / side)} of its smallest side")
+    return Fit(_ANY, side, True, False, "closed, not convex")
 
 
 def _percent(value: float) -> str:

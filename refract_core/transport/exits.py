@@ -10,12 +10,11 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-
 from ..kernels.compile import inlined
 from ..kernels.lanes import LANES, Flags, Scalars, Vectors, Words, put
 from ..kernels.vec import Vec, along, dot, flip_towards, mul, normalize, row, scale, sub
-from ..optics.interface import THIN_THICKNESS, box_model, reflect, refract, sphere_model, thin_model, transmittance
+from ..optics.interface import reflect, refract, transmittance
+from ..optics.models import WALL, absorption_distance_of, exit_of, is_sheet, is_walked, on_open_mesh, thickness_of
 from ..scene import Model, Param
 from ..world.embree import (
     COHERENT,
@@ -50,8 +49,6 @@ from ..world.tracing import intersect_world
 
 MAX_EVENTS = 24
 """Interfaces that one walked ray may meet."""
-MIN_THICKNESS = 1e-4
-"""[m] (HDRP, Lit.hlsl)"""
 
 # What became of a lane's ray.
 LEFT, EMBEDDED, LOST = 0, 1, 2
@@ -96,17 +93,13 @@ def load_medium(exits: Exits, lane: int, at: Interaction, world: World, override
     """Look up the refraction attributes at an entry. `override`: a `Model` for every material, or -1."""
     m = at.hit.material
     model = world.materials.model[m] if override < 0 else override
-    if model == Model.TRACED.value and world.geometry.sheet[at.hit.part] != 0:
-        model = Model.THIN.value  # an open mesh has no far side to find; `open_meshes` says so to the user
-    thickness = max(MIN_THICKNESS, float_input(world, at, Param.THICKNESS.value))
-    distance: float = np.float64(world.materials.absorption_distance[m])
-    if model == Model.THIN.value:
-        thickness = distance = THIN_THICKNESS
+    if world.geometry.sheet[at.hit.part] != 0:
+        model = on_open_mesh(model)  # `open_meshes` says so to the user
     exits.on[lane] = 1
     exits.model[lane] = model
     exits.ior[lane] = max(1.0, float_input(world, at, Param.IOR.value))
-    exits.thickness[lane] = thickness
-    exits.absorption_distance[lane] = distance
+    exits.thickness[lane] = thickness_of(model, float_input(world, at, Param.THICKNESS.value))
+    exits.absorption_distance[lane] = absorption_distance_of(model, world.materials.absorption_distance[m])
     put(exits.color, lane, color_input(world, at, Param.TRANSMITTANCE.value))
 
 
@@ -125,19 +118,12 @@ def find_exits(exits: Exits, block: Block, parts: Words, packet: Packet, world: 
         if exits.on[lane] == 0:
             continue
         p, n, wo = row(block.point, lane), row(block.ns, lane), row(block.wo, lane)
-        model, ior = exits.model[lane], exits.ior_now[lane]
-        if model == Model.TRACED.value:
+        model = exits.model[lane]
+        if is_walked(model):
             walks = True
             _start_walk(exits, lane, block, parts[lane])
             continue
-        if model == Model.SPHERE.value:
-            length, point, direction = sphere_model(p, n, wo, ior, exits.thickness[lane])
-        elif model == Model.BOX.value:
-            length, point, direction = box_model(p, n, wo, ior, exits.thickness[lane])
-        elif model == Model.THIN.value:
-            length, point, direction = thin_model(p, n, wo, ior)
-        else:
-            length, point, direction = 0.0, p, scale(wo, -1.0)
+        length, point, direction = exit_of(model, p, n, wo, exits.ior_now[lane], exits.thickness[lane])
         put(exits.point, lane, point)
         put(exits.direction, lane, direction)
         exits.path_length[lane] = length
@@ -254,15 +240,15 @@ def _meet(exits: Exits, lane: int, world: World) -> None:
     if inside >= 0 and thing[hit.part] == thing[inside] and leaving:
         _absorb(exits, lane, hit.t)
         _leave(exits, lane, at, world)
-    elif inside < 0 and not leaving and sheet[hit.part] == 0 and model != Model.THIN.value:
+    elif inside < 0 and not leaving and sheet[hit.part] == 0 and not is_sheet(model):
         _enter(exits, lane, at, world)
     else:  # another thing's surface within this one, a pane, a sheet: the ray goes straight on
         if inside >= 0:
             _absorb(exits, lane, hit.t)
-        elif model == Model.THIN.value or sheet[hit.part] != 0:
+        elif is_sheet(model) or sheet[hit.part] != 0:
             cosine = max(1e-3, abs(dot(at.ng, d)))
             tint = color_input(world, at, Param.TRANSMITTANCE.value)
-            through = transmittance(tint, THIN_THICKNESS, THIN_THICKNESS / cosine)
+            through = transmittance(tint, WALL, WALL / cosine)
             put(exits.transmittance, lane, mul(row(exits.transmittance, lane), through))
         _go_on(exits, lane, at, d)
 

@@ -196,7 +196,7 @@ def _coat(site: Usd.Prim, material: UsdShade.Material, row: Material, rows: _Row
         bound=str(editable(site) or ""),
         binding=_binding(site),
         applied=applied,
-        mapped=applied and row.model is not Model.THIN and source.primvar != THICKNESS_PRIMVAR,
+        mapped=applied and not row.model.fixed_thickness and source.primvar != THICKNESS_PRIMVAR,
         model=row.model,
         ior=max(float(row.inputs[Param.IOR].value[0]), 1.0),
         multiplier=float(value) if isinstance(value, float) and value > 0.0 else 1.0,

@@ -152,7 +152,7 @@ def _tell(report: Report, found: Found, work: Work, lost: Iterable[Notice]) -> N
     for notice in (*work.left, *lost):
         report.warning(notice.path, notice.text)
     for path in work.fixed:
-        report.done(path, "left alone: the thin model fixes the thickness at 5 mm")
+        report.done(path, "left alone: its model fixes the thickness")
     measured = {row.path for row in work.rows}
     for coat in work.coats.values():
         others = sorted(found.bound_to[coat.material] - measured)

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import Cancelled, StageError, UsageError
 from ..files import folder_beside, replacing
-from ..scene import Model, Notice
-from ..settings import MODELS
+from ..models import BY_TOKEN, MODELS, SHEET, SOLID, Behind, Model
+from ..scene import Notice
 from ..thickness.fit import alike, together
 
 if TYPE_CHECKING:
@@ -24,10 +24,6 @@ if TYPE_CHECKING:
 THICKNESS = ("typed", "measured")
 TARGETS = ("preview", "openpbr", "gltf")
 GLTF = (".glb", ".gltf")
-_THIN = 0.005
-"""[m] the thin model's own thickness and absorption distance"""
-_SIZED = (Model.SPHERE, Model.BOX)
-"""Models that need a thickness."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,19 +212,19 @@ def _plan(glass: Glass, uses: list[Use], forced: str, unit: float) -> _Plan:
     thickness: float | None = None
     per_prim: dict[str, float] | None = {}
     more: list[str] = []
-    if model in _SIZED:
+    if model.sized:
         thickness, per_prim, more = _thickness(glass, uses)
         if per_prim is None and not forced:
-            model, thickness, more = Model.TRACED, None, []
+            model, thickness, more = SOLID, None, []
             why = "one prim is drawn in several sizes, and a typed thickness is one number"
     color, distance = _absorption(glass, model, thickness, unit, more)
     if glass.authored:
         more.append(f"authored already, and kept: {', '.join(sorted(glass.authored))}")
     row = replace(
-        row, model=model.name.lower(), color=color, color_from=glass.color_from, distance=distance,
+        row, model=model.token, color=color, color_from=glass.color_from, distance=distance,
         thickness=thickness, why=why, notes=tuple(dict.fromkeys((*glass.notes, *notes, *more))),
     )  # fmt: skip
-    sized = tuple(use.path for use in uses if use.edit) if model in _SIZED else ()
+    sized = tuple(use.path for use in uses if use.edit) if model.sized else ()
     return _Plan(row, tuple(_additions(glass, row, per_prim or {})), sized)
 
 
@@ -238,16 +234,16 @@ def _model(glass: Glass, uses: list[Use], forced: str) -> tuple[Model, str, list
     if any(use.cage for use in uses):
         notes.append("judged by the control cage of a subdivision surface, which is what is drawn")
     if forced:
-        return Model[forced.upper()], "--model", notes
+        return BY_TOKEN[forced], "--model", notes
     if glass.thin:
-        return Model.THIN, "thin-walled by its shader", notes
+        return SHEET, "thin-walled by its shader", notes
     fits = [fit for use in uses for fit in use.fits]
     if not fits:
-        return Model.TRACED, "nothing that is drawn is bound to it", notes
+        return SOLID, "nothing that is drawn is bound to it", notes
     best = together(fits)
     opened = [use.path for use in uses if not all(fit.closed for fit in use.fits)]
-    if best.model is Model.TRACED and opened:
-        notes.append(f"{opened[0]} is open, so it is drawn as 'thin'; give it a material of its own to say so")
+    if best.model.behind is Behind.MESH and opened:
+        notes.append(f"{opened[0]} is open, so it is drawn as '{SHEET.token}'; give it a material of its own to say so")
     return best.model, best.why, notes
 
 
@@ -278,21 +274,22 @@ def _absorption(
     """Colour and the distance after which it is left; None where the model fixes it or nothing is absorbed."""
     color = tuple(_neat(value) for value in glass.color)
     clear = color == (1.0, 1.0, 1.0) and not glass.color_from
-    if model is Model.THIN:
+    if model.fixed_thickness:
+        own = f"the {model.token} model's {model.fixed_thickness * 1000:g} mm"
         if clear or glass.distance is None:
             return color, None  # type: ignore[return-value]
         if glass.color_from:
-            notes.append("the colour is mapped, so it holds for the thin model's 5 mm instead of its own distance")
+            notes.append(f"the colour is mapped, so it holds for {own} instead of its own distance")
             return color, None  # type: ignore[return-value]
-        # The thin model's way through is 5 mm; after it, color^(5 mm / distance) is left.
-        power = _THIN / (glass.distance * unit)
-        notes.append(f"colour taken from {_neat(glass.distance):g} units to the thin model's 5 mm")
+        # After the way through a wall of fixed thickness, color^(thickness / distance) is left.
+        power = model.fixed_thickness / (glass.distance * unit)
+        notes.append(f"colour taken from {_neat(glass.distance):g} units to {own}")
         return tuple(_neat(value**power) for value in color), None  # type: ignore[return-value]
     if clear:
         return color, None  # type: ignore[return-value]
     if glass.distance is not None:
         return color, _neat(glass.distance)  # type: ignore[return-value]
-    distance = thickness if model in _SIZED and thickness else 1.0
+    distance = thickness if model.sized and thickness else 1.0
     notes.append(f"its colour tints a surface at any depth; here it is left after {distance:g} units")
     return color, distance  # type: ignore[return-value]
 

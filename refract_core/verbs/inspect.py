@@ -34,7 +34,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import Cancelled
-from ..scene import F64, Camera, Model, Param, Source
+from ..models import Behind
+from ..scene import F64, Camera, Param, Source
 from ..version import __version__
 from .validate import SEVERITIES, finding_record
 
@@ -219,7 +220,7 @@ def _entries(origin: F64, direction: F64, piece: Glass) -> int:
         to = piece.points[0] - origin
         along = float(to @ direction)
         struck = along > 0.0 and float(to @ to) - along**2 < piece.radius**2 < float(to @ to)
-        return int(struck) * (2 if piece.model is Model.THIN else 1)
+        return int(struck) * (2 if piece.model.behind is Behind.SHEET else 1)
     at = piece.points[piece.triangles]
     u, v, start = at[:, 1] - at[:, 0], at[:, 2] - at[:, 0], origin - at[:, 0]
     across, turned = np.cross(direction, v), np.cross(start, u)
@@ -228,7 +229,7 @@ def _entries(origin: F64, direction: F64, piece: Glass) -> int:
         first, second = (start * across).sum(axis=1) / facing, (turned @ direction) / facing
         distance = (v * turned).sum(axis=1) / facing
         hit = (first >= 0.0) & (second >= 0.0) & (first + second < 1.0) & (distance > 0.0)
-    either = not piece.closed or piece.model is Model.THIN
+    either = not piece.closed or piece.model.behind is Behind.SHEET
     met = np.sort(distance[hit & (either | (facing > 0.0))])
     # A ray through the edge of two triangles meets both of them.
     return int(len(met) > 0) + int((np.diff(met) > 1e-6 * met[1:]).sum())

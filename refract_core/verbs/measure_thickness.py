@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..scene import F32, F64, Model, Notice
+from ..models import Behind
+from ..scene import F32, F64, Notice
 
 if TYPE_CHECKING:
     from ..usd.thickness import Map, Values
@@ -74,7 +75,7 @@ def measure_all(
     for number, candidate in enumerate(chosen):
         how.go_on()
         progress(number / len(chosen), f"measuring {candidate.path}")
-        coats = tuple(coat for coat in candidate.coats if coat.model is not Model.THIN)
+        coats = tuple(coat for coat in candidate.coats if not coat.model.fixed_thickness)
         if not coats:
             work.fixed.append(candidate.path)
             continue
@@ -127,7 +128,7 @@ def _advice(candidate: Candidate, how: How) -> Iterator[str]:
             )
         if coat.mapped and not coat.edit:
             yield f"the map of {coat.material} comes first, and lies in an instance, where it cannot be disconnected"
-    kinds = {(coat.model is Model.BOX, coat.ior) for coat in candidate.coats}
+    kinds = {(coat.model.behind is Behind.SLAB, coat.ior) for coat in candidate.coats}
     if how.along == "refracted" and len(kinds) > 1:
         yield f"it has several kinds of glass; that of {candidate.coats[0].material} is used for all of it"
 
@@ -136,7 +137,7 @@ def _views(candidate: Candidate, how: How) -> F64:
     from ..thickness.measure import views
 
     coat = candidate.coats[0]
-    return views(coat.model is Model.BOX, coat.ior, how.along)
+    return views(coat.model.behind is Behind.SLAB, coat.ior, how.along)
 
 
 def _corners(

@@ -10,8 +10,8 @@ from numbers import Real
 from typing import Any
 
 from ..errors import UsageError
-from ..scene import Material, Model, Param, Scene, Source
-from ..settings import MODELS
+from ..models import BY_TOKEN, MODELS, Model
+from ..scene import Material, Param, Scene, Source
 
 Overrides = Mapping[str, Mapping[str, Any]]
 """Path of a material, or of a mesh or sphere bound to it -> field -> value. Lengths in scene units."""
@@ -24,8 +24,6 @@ RANGES = {
 LENGTHS = ("thickness", "absorptionDistance")
 COLORS = ("transmittanceColor",)
 FIELDS = ("model", *RANGES)
-THIN_THICKNESS = 0.005
-"""[m] thickness and absorption distance of the thin model, whatever is asked for."""
 _PARAMS = {"ior": Param.IOR, "roughness": Param.ROUGHNESS, "transmittanceColor": Param.TRANSMITTANCE,
            "thickness": Param.THICKNESS}  # fmt: skip
 
@@ -148,12 +146,12 @@ def _overridden(material: Material, changes: Mapping[str, Any], unit: float) -> 
         elif field in given:
             inputs[param] = _scalar(given[field] * (unit if field in LENGTHS else 1.0))
     distance = given["absorptionDistance"] * unit if "absorptionDistance" in given else material.absorption_distance
-    model = Model[given["model"].upper()] if "model" in given else material.model
+    model = BY_TOKEN[given["model"]] if "model" in given else material.model
     if model is not Model.NONE and not material.refractive:
         inputs[Param.OPACITY] = _scalar(0.0)  # it had no opacity of glass to begin with
-    if model is Model.THIN:
-        inputs[Param.THICKNESS] = _scalar(THIN_THICKNESS)
-        distance = THIN_THICKNESS
+    if model.fixed_thickness:
+        inputs[Param.THICKNESS] = _scalar(model.fixed_thickness)
+        distance = model.fixed_thickness
     return replace(material, inputs=tuple(inputs), model=model, absorption_distance=distance)
 
 

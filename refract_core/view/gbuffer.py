@@ -12,6 +12,7 @@ from ..kernels.compile import inlined, kernel
 from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Flags, Scalars
 from ..kernels.sampling import Key, set_key
 from ..kernels.vec import Vec, dot
+from ..optics.models import is_sheet
 from ..scene import Model
 from ..world.embree import (
     COHERENT,
@@ -91,7 +92,7 @@ def new_refractive_layer(width: int, height: int) -> RefractiveLayer:
 @inlined
 def _enters(world: World, hit: Hit, ray: Ray) -> bool:
     """The ray meets a refractive surface from outside: any side of a sheet, the outer side of a solid."""
-    if world.geometry.sheet[hit.part] != 0 or world.materials.model[hit.material] == Model.THIN.value:
+    if world.geometry.sheet[hit.part] != 0 or is_sheet(world.materials.model[hit.material]):
         return True
     return dot(interaction(world.geometry, hit, ray, 0.0).ng, ray.direction) < 0.0
 

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
-from ...scene import F64, U32, Model, Notice
+from ...models import SOLID
+from ...scene import F64, U32, Notice
 from ...settings import PURPOSES
 from ...thickness.fit import Fit, fit
 from ..geometry.parts import Bound, bind
@@ -160,5 +161,5 @@ def _fit(shape: Shape, triangles: U32, scale: float, gram: F64, fits: _Fits) -> 
         stretched = shape.points.astype(np.float64) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
         fits[key] = fit(stretched, triangles)
         if not fits[key].closed and shape.closed and len(triangles) < len(shape.triangles):
-            fits[key] = replace(fits[key], model=Model.TRACED, closed=True, why="an open part of a closed mesh")
+            fits[key] = replace(fits[key], model=SOLID, closed=True, why="an open part of a closed mesh")
     return replace(fits[key], thickness=fits[key].thickness * scale)

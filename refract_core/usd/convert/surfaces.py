@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 
 from pxr import Gf, Sdf, Usd, UsdShade
 
-from ...scene import Material, Model, Notice, Param, Source, Texture
+from ...models import Behind, Model
+from ...scene import Material, Notice, Param, Source, Texture
 from ..materials.read import read_material
 from ..materials.sources import is_constant
 from ..stage import stage_unit, time_range
@@ -201,7 +202,7 @@ def _preview(record: Material, unit: float) -> tuple[_Inputs, _Inputs]:
 
 
 def _open_pbr(record: Material, unit: float) -> tuple[_Inputs, _Inputs]:
-    thin = record.model is Model.THIN
+    thin = record.model.behind is Behind.SHEET
     glass: _Inputs = {
         "transmission_weight": _neat(1.0 - _one(record, Param.OPACITY)),
         "specular_ior": _one(record, Param.IOR),
@@ -223,7 +224,7 @@ def _open_pbr(record: Material, unit: float) -> tuple[_Inputs, _Inputs]:
 
 
 def _gltf(record: Material, unit: float) -> tuple[_Inputs, _Inputs]:
-    thin = record.model is Model.THIN
+    thin = record.model.behind is Behind.SHEET
     tint = _three(record.inputs[Param.TRANSMITTANCE])
     glass: _Inputs = {
         "transmission": _neat(1.0 - _one(record, Param.OPACITY)),

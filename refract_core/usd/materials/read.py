@@ -12,8 +12,8 @@ from typing import Any
 from pxr import Usd, UsdShade
 
 from ...errors import StageError
-from ...scene import Material, Model, Notice, Param, Source, Texture
-from ...settings import MODELS
+from ...models import BY_TOKEN, DEFAULT, MODELS, SHEET, SOLID, Model
+from ...scene import Material, Notice, Param, Source, Texture
 from .glass import READERS
 from .sources import Context, constant, is_constant, node_name, note, producer, read_number, read_source, scaled
 from .surfaces import DEFAULTS, Surface, clamped, display_color_inputs, lowest, read_preview_surface
@@ -21,8 +21,6 @@ from .vendors import CONTEXTS, vendor_id
 from .vendors import READERS as VENDOR_READERS
 
 API = "RefractMaterialAPI"
-THIN_THICKNESS = 0.005
-"""[m] thickness and absorption distance of the thin model, whatever is authored (HDRP's thin model)."""
 THICKNESS_PRIMVAR = "refraction:thickness"
 _PREVIEW = ("UsdPreviewSurface", "ND_UsdPreviewSurface_surfaceshader")
 
@@ -164,13 +162,13 @@ def _shader_glass(context: Context, row: Material, surface: Surface, *, thin: bo
     """
     if thin:
         color = _thin_color(context, row.inputs[Param.TRANSMITTANCE], surface.absorption_distance)
-        changes = {Param.THICKNESS: constant(THIN_THICKNESS), Param.TRANSMITTANCE: color}
-        return _with(row, changes, model=Model.THIN, absorption_distance=THIN_THICKNESS)
+        changes = {Param.THICKNESS: constant(SHEET.fixed_thickness), Param.TRANSMITTANCE: color}
+        return _with(row, changes, model=SHEET, absorption_distance=SHEET.fixed_thickness)
     tint = row.inputs[Param.TRANSMITTANCE]
     if surface.absorption_distance is None and tint != constant(DEFAULTS[Param.TRANSMITTANCE]):
         note(context, "has a transmission colour without a depth, which tints a surface; "
              "it is read as the colour left after one scene unit; author a depth")  # fmt: skip
-    return _with(row, {}, model=Model.TRACED, absorption_distance=surface.absorption_distance or unit)
+    return _with(row, {}, model=SOLID, absorption_distance=surface.absorption_distance or unit)
 
 
 def _thin_color(context: Context, color: Source, distance: float | None) -> Source:
@@ -178,11 +176,11 @@ def _thin_color(context: Context, color: Source, distance: float | None) -> Sour
     if distance is None or color == constant(DEFAULTS[Param.TRANSMITTANCE]):
         return color
     if not is_constant(color):
-        note(context, f"its transmission colour is mapped, so it is read as left after {THIN_THICKNESS} m, "
-             "the thin model's own distance")  # fmt: skip
+        note(context, f"its transmission colour is mapped, so it is read as left after {SHEET.fixed_thickness} m, "
+             f"the {SHEET.token} model's own distance")  # fmt: skip
         return color
     r, g, b, a = color.value
-    power = THIN_THICKNESS / distance
+    power = SHEET.fixed_thickness / distance
     return replace(color, value=(r**power, g**power, b**power, a))
 
 
@@ -221,12 +219,12 @@ def _refraction(context: Context, material: UsdShade.Material, surface: Surface,
 
 def _model(material: UsdShade.Material) -> Model:
     attribute = material.GetPrim().GetAttribute("refraction:model")
-    token = str((attribute.Get() if attribute else None) or "sphere")
+    token = str((attribute.Get() if attribute else None) or DEFAULT.token)
     if token not in MODELS:
         raise StageError(
             f"{material.GetPath()}: refraction:model is '{token}'; author one of {', '.join(MODELS)}",
         )
-    return Model[token.upper()]
+    return BY_TOKEN[token]
 
 
 def _opacity(context: Context, surface: Surface) -> Source:
@@ -245,11 +243,12 @@ def _opacity(context: Context, surface: Surface) -> Source:
 def _thickness(context: Context, material: UsdShade.Material, model: Model, unit: float) -> Source:
     """Connected texture or primvar, then primvars:refraction:thickness, then the constant; in metres."""
     port = material.GetInput("refraction:thickness")
-    if model is Model.THIN:
+    if model.fixed_thickness:
         for name in ("thickness", "absorptionDistance"):
             if _is_authored(context, material.GetInput(f"refraction:{name}")):
-                note(context, f"inputs:refraction:{name} is ignored: the thin model fixes it at {THIN_THICKNESS} m")
-        return constant(THIN_THICKNESS)
+                fixed = f"the {model.token} model fixes it at {model.fixed_thickness} m"
+                note(context, f"inputs:refraction:{name} is ignored: {fixed}")
+        return constant(model.fixed_thickness)
     multiplier = read_number(context, material.GetInput("refraction:thicknessMultiplier"), 1.0)
     if multiplier <= 0.0:
         note(context, f"inputs:refraction:thicknessMultiplier is {multiplier}; it must be above 0; 1 is used")
@@ -265,8 +264,8 @@ def _thickness(context: Context, material: UsdShade.Material, model: Model, unit
 
 
 def _absorption_distance(context: Context, material: UsdShade.Material, model: Model, unit: float) -> float:
-    if model is Model.THIN:
-        return THIN_THICKNESS
+    if model.fixed_thickness:
+        return model.fixed_thickness
     distance = float(read_number(context, material.GetInput("refraction:absorptionDistance"), 1.0))
     if distance <= 0.0:
         note(context, f"inputs:refraction:absorptionDistance is {distance}; it must be above 0; 1 is used")

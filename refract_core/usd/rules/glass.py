@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...scene import F64, Material, Mesh, Model, Param, Scene, Source, Sphere
+from ...models import SHEET, Behind, Model, model_for
+from ...scene import F64, Material, Mesh, Param, Scene, Source, Sphere
 from ...thickness.fit import CONVEX_TOLERANCE
 from .values import ERROR, WARNING, Finding, Repair, Rule
 
@@ -39,7 +40,7 @@ class Thickness(NamedTuple):
     """How thick a piece of glass is said to be."""
 
     how: str
-    """typed, mapped (a texture), measured (a primvar), fixed (by the thin model) or unused (by the traced one)"""
+    """typed, mapped (a texture), measured (a primvar), fixed by the model or unused by it"""
     low: float
     """[m]"""
     high: float
@@ -107,10 +108,10 @@ def _of_sphere(ball: Sphere, scene: Scene) -> Glass:
 
 def _thickness(row: Material, primvars: dict[str, NDArray[np.float32]], scene: Scene) -> Thickness:
     source = row.inputs[Param.THICKNESS]
-    if row.model is Model.THIN:
+    if row.model.fixed_thickness:
         return Thickness("fixed", source.value[0], source.value[0])
     how, low, high = _extent(source, primvars, scene)
-    return Thickness("unused" if row.model is Model.TRACED else how, low, high)
+    return Thickness(how if row.model.sized else "unused", low, high)
 
 
 def _extent(source: Source, primvars: dict[str, NDArray[np.float32]], scene: Scene) -> tuple[str, float, float]:
@@ -199,24 +200,26 @@ def _finding(rule: Rule, path: str, text: str, fix: str, about: str = "", repair
 
 def _shape(piece: Glass) -> Iterator[Finding]:
     convert = "run refract convert, which chooses a model by the shape"
-    if piece.model is Model.SPHERE and not piece.closed:
-        text = f"the sphere model of {piece.row.name} is on an open mesh, which is no ball; use thin or box"
-        yield _finding(OPEN, piece.path, text, f"set refraction:model to 'thin', or {convert}", "refraction:model")
-    elif piece.model is Model.SPHERE and piece.sides[0] < FLAT * piece.sides[2]:
+    model, flat = f"the {piece.model.token} model of {piece.row.name}", model_for(Behind.SLAB).token
+    if piece.model.behind is Behind.MESH and not piece.closed:
+        text = f"{model} is on an open mesh, which has no far side; it is drawn as '{SHEET.token}'"
+        yield _finding(TRACED_OPEN, piece.path, text, f"close the mesh, or set refraction:model to '{SHEET.token}'")
+    elif piece.model.row.needs_closed and not piece.closed:
+        text = f"{model} is on an open mesh, which has no inside; use {SHEET.token} or {flat}"
+        fix = f"set refraction:model to '{SHEET.token}', or {convert}"
+        yield _finding(OPEN, piece.path, text, fix, "refraction:model")
+    elif piece.model.behind is Behind.BALL and piece.sides[0] < FLAT * piece.sides[2]:
         a, b, c = piece.sides
-        text = f"the sphere model of {piece.row.name} is on a flat body of {a:.3g} x {b:.3g} x {c:.3g} m"
-        fix = f"set refraction:model to 'box', or {convert}"
+        text = f"{model} is on a flat body of {a:.3g} x {b:.3g} x {c:.3g} m"
+        fix = f"set refraction:model to '{flat}', or {convert}"
         yield _finding(FLAT_SPHERE, piece.path, text, fix, "refraction:model")
-    elif piece.model is Model.TRACED and not piece.closed:
-        text = f"the traced model of {piece.row.name} is on an open mesh, which has no far side; it is drawn as 'thin'"
-        yield _finding(TRACED_OPEN, piece.path, text, "close the mesh, or set refraction:model to 'thin'")
 
 
 def _lengths(piece: Glass, unit: float) -> Iterator[Finding]:
     """The unit trap first: where it explains the size, that is all there is to say."""
-    if piece.model not in (Model.SPHERE, Model.BOX) or not piece.closed or piece.sides[0] <= 0.0:
+    if not piece.model.sized or not piece.closed or piece.sides[0] <= 0.0:
         return
-    size = piece.sides[0] if piece.model is Model.BOX else float(np.prod(piece.sides) ** (1.0 / 3.0))
+    size = piece.sides[0] if piece.model.behind is Behind.SLAB else float(np.prod(piece.sides) ** (1.0 / 3.0))
     high, about = piece.thickness.high, "thickness"
     for name, metres in _UNITS.items():
         factor = metres / unit
@@ -233,9 +236,9 @@ def _lengths(piece: Glass, unit: float) -> Iterator[Finding]:
     if high > LONGER * piece.sides[2]:
         text = f"the thickness of {piece.row.name} is {high:.3g} m, but the body is {piece.sides[2]:.3g} m at most"
         yield _finding(SIZE, piece.path, text, measured, about)
-    elif piece.model is Model.SPHERE and high < THINNER * piece.sides[0]:
+    elif piece.model.behind is Behind.BALL and high < THINNER * piece.sides[0]:
         text = f"the thickness of {piece.row.name} is {high:.3g} m, but the body is {piece.sides[0]:.3g} m at least"
-        yield _finding(SIZE, piece.path, text, f"{measured}; a hollow body wants the thin model", about)
+        yield _finding(SIZE, piece.path, text, f"{measured}; a hollow body wants the {SHEET.token} model", about)
 
 
 def _no_uv(piece: Glass) -> Finding:

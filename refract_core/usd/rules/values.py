@@ -12,13 +12,11 @@ from typing import Any, NamedTuple
 
 from pxr import Sdf, Usd, UsdShade
 
+from ...models import BY_TOKEN, LEAST_THICKNESS, Model
 from .. import ours
-from ..materials.read import THIN_THICKNESS
 from ..stage import stage_unit
 
 ERROR, WARNING, INFO = "error", "warning", "info"
-LEAST_THICKNESS = 1.0e-4
-"""[m]: what the renderer makes of a thickness of 0."""
 _MAX_SAMPLES = 10_000
 """Time samples of one attribute that are looked at."""
 
@@ -70,6 +68,7 @@ FALLBACK = Rule(
 )
 
 _ALLOWED = "allowedTokens"
+_SIZED = " or ".join(f"'{model.token}'" for model in Model if model.sized)
 # Where the lowest value itself is out of the range; the schema's limits cannot say so.
 _ABOVE_ZERO = frozenset(
     f"inputs:refraction:{name}" for name in ("thickness", "thicknessMultiplier", "absorptionDistance")
@@ -126,9 +125,10 @@ def _of_prim(prim: Usd.Prim, fields: Sequence[_Field]) -> list[Finding]:
         attribute = _source(prim.GetAttribute(field.name))
         if attribute is not None and attribute.HasAuthoredValue():
             found += _of_attribute(attribute, field, unit)
-    model = prim.GetAttribute("refraction:model")
-    if model and model.Get() == "thin":
-        found += _of_thin(prim)
+    attribute = prim.GetAttribute("refraction:model")
+    model = BY_TOKEN.get(str(attribute.Get())) if attribute else None
+    if model and model.fixed_thickness:
+        found += _of_fixed(prim, model)
     return found
 
 
@@ -245,12 +245,13 @@ def _wanted(field: _Field) -> str:
     return f"{many}{field.low[0]:g} or more" if field.low else f"{many}a finite number"
 
 
-def _of_thin(prim: Usd.Prim) -> Iterator[Finding]:
+def _of_fixed(prim: Usd.Prim, model: Model) -> Iterator[Finding]:
     for name in ("inputs:refraction:thickness", "inputs:refraction:absorptionDistance"):
         attribute = prim.GetAttribute(name)
         if attribute and (attribute.HasAuthoredValue() or attribute.HasAuthoredConnections()):
-            text = f"{name} is authored but does nothing: the thin model fixes it at {THIN_THICKNESS * 1000:g} mm"
-            fix = f"block {name}, or set refraction:model to 'box' or 'sphere' where the thickness matters"
+            fixed = f"the {model.token} model fixes it at {model.fixed_thickness * 1000:g} mm"
+            text = f"{name} is authored but does nothing: {fixed}"
+            fix = f"block {name}, or set refraction:model to {_SIZED} where the thickness matters"
             yield Finding(THIN.id, THIN.severity, str(prim.GetPath()), text, fix, name)
 
 
