@@ -51,7 +51,7 @@ MUTANTS = (
            "red if channel == _RED else (green if channel == _GREEN else blue)",
            "blue if channel == _RED else (green if channel == _GREEN else red)"),
     Mutant("a pane absorbs without its cosine", "transport/exits.py",
-           "THIN_THICKNESS / cosine", "THIN_THICKNESS"),
+           "WALL / cosine", "WALL"),
     Mutant("no tie-break where glass touches a table", "world/offsets.py",
            "return 4.0 * _reach(point)", "return 0.0 * _reach(point)"),
     Mutant("no normal map where a walk leaves", "transport/exits.py",

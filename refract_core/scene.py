@@ -159,10 +159,25 @@ class Sphere:
 
 
 class LightKind(IntEnum):
-    DISTANT = 0
-    SPHERE = 1
-    RECT = 2
-    DISK = 3
+    """The kinds of light: how each shines is its row in `world.lights`, how its size is read one in `usd.lights.read`.
+    The value is what kernels see."""
+
+    DISTANT = 0, "DistantLight"
+    SPHERE = 1, "SphereLight"
+    RECT = 2, "RectLight"
+    DISK = 3, "DiskLight"
+    CAMERA = 4, "", False
+    """Stands in where a stage has no light: at the eye, without falloff. Nothing it lights is in a shadow."""
+
+    usd_type: str
+    """Its prim type in UsdLux; '' for none."""
+    casts_shadow: bool
+
+    def __new__(cls, number: int, usd_type: str, casts_shadow: bool = True) -> LightKind:
+        member = int.__new__(cls, number)
+        member._value_ = number
+        member.usd_type, member.casts_shadow = usd_type, casts_shadow
+        return member
 
 
 @dataclass(frozen=True)

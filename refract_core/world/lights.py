@@ -4,32 +4,42 @@ The unoccluded diffuse light of a shape is taken in closed form and multiplied b
 an unshadowed surface has no noise at all and only penumbras need samples. The highlight comes from the point of the
 shape nearest to the mirror direction (Karis, "Real Shading in Unreal Engine 4", 2013, area lights), and from the shape
 itself where the surface is a mirror.
+
+Every kind of light is one row of `KINDS`: three functions of a `Lamp`. Directions are unit vectors unless they are said
+to be more, lengths metres, all in engine world. Nothing here raises.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels.compile import inlined
-from ..kernels.vec import add, cross, dot, frame, length, lerp, normalize, row, scale, sub
+from ..kernels.choice import choice
+from ..kernels.compile import inlined, leaf
+from ..kernels.vec import Vec, add, cross, dot, frame, length, lerp, normalize, row, scale, sub
 from ..optics.lobes import ggx, smith_visibility
-from ..scene import LightKind, Scene
+from ..scene import Light, LightKind, Scene
 
-CAMERA_LIGHT = 4
-"""Kind of the light that stands in where a stage has none: at the eye, without falloff or shadow."""
 _DISK_SIDES = 12
-_SMALLEST_POINT_LOBE = 0.02  # a light without size would be an infinitely bright dot on a mirror
-_DISTANT, _SPHERE, _RECT, _DISK = (int(k) for k in LightKind)
+"""A disk's irradiance is that of the regular polygon with as many sides and the disk's area."""
+_SMALLEST_POINT_LOBE = 0.02
+"""GGX width [alpha] below which a light without size is not sharpened: it would be an infinitely bright dot."""
+_NEAREST2 = 1e-12
+"""[m^2] squared distance that a light counts as having at least, so that nothing is divided by 0."""
+
+
+# --- the table ------------------------------------------------------------------------------------------------------
 
 
 class LightTable(NamedTuple):
     """One row per light."""
 
     kind: NDArray[np.int32]
+    """shape (L,), as `scene.LightKind`"""
     axes: NDArray[np.float64]
     """shape (L, 4, 3): unit x, unit y, unit direction it faces (its -Z), position [m]"""
     size: NDArray[np.float64]
@@ -37,229 +47,92 @@ class LightTable(NamedTuple):
     radiance: NDArray[np.float64]
     """shape (L, 3); the limit quantity where size is 0 (see `scene.Light`)"""
     diffuse: NDArray[np.float64]
+    """shape (L,): factor of what it brings to diffuse reflection"""
     specular: NDArray[np.float64]
+    """shape (L,): factor of its highlights"""
+    casts_shadow: NDArray[np.uint8]
+    """shape (L,)"""
+
+
+class Lamp(NamedTuple):
+    """One light as a kernel holds it."""
+
+    x: Vec
+    y: Vec
+    face: Vec
+    """where it shines"""
+    centre: Vec
+    """[m]"""
+    a: float
+    """first of `LightTable.size`"""
+    b: float
+    """second of `LightTable.size`"""
 
 
 def pack_lights(scene: Scene, eye: NDArray[np.float64]) -> LightTable:
     """Lights of a scene; with none at all, one at the eye that lights a white surface facing it to 1."""
-    kinds = [int(light.kind) for light in scene.lights]
-    frames: list[Any] = []
-    for light in scene.lights:
-        m = light.world_from_light
-        frames.append([m[:3, 0], m[:3, 1], -m[:3, 2], m[:3, 3]])
-    # Rect sizes are full widths and Distant sizes full angles in the scene; kernels want halves.
-    half = {_RECT: 0.5, _DISTANT: 0.5}
-    sizes = [tuple(s * half.get(int(light.kind), 1.0) for s in light.size) for light in scene.lights]
-    radiance = [light.radiance for light in scene.lights]
-    if scene.camera_light:
-        kinds.append(CAMERA_LIGHT)
-        frames.append([[1, 0, 0], [0, 1, 0], [0, 0, -1], eye])
-        sizes.append((0.0, 0.0))
-        radiance.append((math.pi, math.pi, math.pi))
-    n = len(kinds)
+    lights = [*scene.lights, *([_camera_light(eye)] if scene.camera_light else [])]
+    places = [light.world_from_light for light in lights]
+    factors = [KINDS[light.kind].size_factor for light in lights]
+    n = len(lights)
     return LightTable(
-        kind=np.array(kinds, np.int32),
-        axes=np.array(frames, np.float64).reshape(n, 4, 3),
-        size=np.array(sizes, np.float64).reshape(n, 2),
-        radiance=np.array(radiance, np.float64).reshape(n, 3),
-        diffuse=np.array([*(light.diffuse for light in scene.lights), 1.0], np.float64)[:n],
-        specular=np.array([*(light.specular for light in scene.lights), 1.0], np.float64)[:n],
+        kind=np.array([light.kind for light in lights], np.int32),
+        axes=np.array([[m[:3, 0], m[:3, 1], -m[:3, 2], m[:3, 3]] for m in places], np.float64).reshape(n, 4, 3),
+        size=np.array([[s * f for s in light.size] for light, f in zip(lights, factors, strict=True)]).reshape(n, 2),
+        radiance=np.array([light.radiance for light in lights], np.float64).reshape(n, 3),
+        diffuse=np.array([light.diffuse for light in lights], np.float64),
+        specular=np.array([light.specular for light in lights], np.float64),
+        casts_shadow=np.array([light.kind.casts_shadow for light in lights], np.uint8),
     )
 
 
-@inlined
-def shadow_ray(lights, l, p, u1, u2):  # type: ignore[no-untyped-def] # noqa: E741
-    """(direction, distance) from `p` to one point of light `l`; distance is along the unit direction."""
-    kind = lights.kind[l]
-    axes = lights.axes[l]
+def _camera_light(eye: NDArray[np.float64]) -> Light:
+    """E = pi on what faces it, so that Lambert's albedo E / pi is the albedo."""
+    place = np.eye(4)
+    place[:3, 3] = eye
+    return Light("", LightKind.CAMERA, (math.pi, math.pi, math.pi), place)
+
+
+@leaf
+def _lamp(lights: LightTable, which: int) -> Lamp:
+    axes = lights.axes[which]
     x, y, face, centre = row(axes, 0), row(axes, 1), row(axes, 2), row(axes, 3)
-    s0, s1 = lights.size[l, 0], lights.size[l, 1]
-    if kind == _DISTANT:
-        to = scale(face, -1.0)
-        if s0 > 0.0:
-            r = math.sin(s0) * math.sqrt(u1)
-            phi = 2.0 * math.pi * u2
-            to = normalize(add(to, add(scale(x, r * math.cos(phi)), scale(y, r * math.sin(phi)))))
-        return to, math.inf
-    target = centre
-    if kind == _RECT:
-        target = add(centre, add(scale(x, (2.0 * u1 - 1.0) * s0), scale(y, (2.0 * u2 - 1.0) * s1)))
-    elif s0 > 0.0 and (kind in (_DISK, _SPHERE)):
-        if kind == _SPHERE:  # the disk the sphere shows to p
-            x, y = frame(normalize(sub(p, centre)))
-        r = s0 * math.sqrt(u1)
-        phi = 2.0 * math.pi * u2
-        target = add(centre, add(scale(x, r * math.cos(phi)), scale(y, r * math.sin(phi))))
-    d = sub(target, p)
-    distance = length(d)
-    return scale(d, 1.0 / max(distance, 1e-12)), distance
+    return Lamp(x, y, face, centre, lights.size[which, 0], lights.size[which, 1])
+
+
+# --- what kernels ask -----------------------------------------------------------------------------------------------
 
 
 @inlined
-def _angle_over_sine(x):  # type: ignore[no-untyped-def]
-    """acos(x) / sqrt(1 - x * x) for x in 0 .. 1, where it is 1 at the end, to 1e-7 of it: a Chebyshev fit, in an order
-    without a long chain. A call of acos takes longer than all the rest of an edge."""
-    x2 = x * x
-    low = (1.5707962222 - 0.99998225999 * x) + (0.78489625578 - 0.66108945254 * x) * x2
-    high = (0.55702205608 - 0.4245661869 * x) + (0.25323847676 - 0.097968704053 * x) * x2
-    return low + (high + 0.017653667906 * (x2 * x2)) * (x2 * x2)
+def shadow_ray(lights: LightTable, which: int, p: Vec, u1: float, u2: float) -> tuple[Vec, float]:
+    """(direction, distance) from `p` to one point of a light; distance is along the unit direction [m].
+
+    Points are spread evenly over the light's area as `p` sees it (of a sphere: over the disk it shows), which is what
+    the share of it that is hidden has to be measured by. `u1`, `u2`: 0 .. 1.
+    """
+    return _target(lights.kind[which], _lamp(lights, which), p, u1, u2)
 
 
 @inlined
-def _polygon_edge(a, b, n):  # type: ignore[no-untyped-def]
-    """One edge of Lambert's formula for two unit directions and the receiver's normal."""
-    cosine = min(1.0, max(-1.0, dot(a, b)))
-    axis = cross(a, b)
-    across = dot(axis, n)
-    angle = _angle_over_sine(abs(cosine))
-    if cosine >= 0.0:
-        return angle * across
-    sine = length(axis)
-    return (math.pi / sine - angle) * across if sine > 1e-9 else 0.0
+def irradiance_factor(lights: LightTable, which: int, p: Vec, n: Vec) -> float:
+    """Unoccluded irradiance at `p` on a surface with normal `n`, per radiance of a light [sr]: the integral of the
+    cosine over the directions that the light fills, horizon included. Without size, the limit's own unit."""
+    return _irradiance(lights.kind[which], _lamp(lights, which), p, n)
 
 
 @inlined
-def _corner(c, x, y, k, sides):  # type: ignore[no-untyped-def]
-    """Corner `k` of the parallelogram with half axes x, y, or of the regular polygon with the area of their ellipse."""
-    if sides == 4:
-        sx = 1.0 if k % 4 == 1 or k % 4 == 2 else -1.0
-        sy = 1.0 if k % 4 == 2 or k % 4 == 3 else -1.0
-        return add(add(c, scale(x, sx)), scale(y, sy))
-    step = 2.0 * math.pi / sides
-    grow = math.sqrt(step / math.sin(step))
-    return add(add(c, scale(x, grow * math.cos(step * k))), scale(y, grow * math.sin(step * k)))
+def highlight(lights: LightTable, which: int, p: Vec, n: Vec, wo: Vec, alpha: float) -> float:
+    """Reflected radiance per radiance of a light, without Fresnel and shadow, for a GGX surface of width alpha.
 
-
-@inlined
-def _polygon_irradiance(p, n, centre, x, y, sides):  # type: ignore[no-untyped-def]
-    """Irradiance per radiance of a flat light, clipped at the receiver's horizon
-    (Lambert 1760; Baum, Rushmeier and Winget 1989)."""
-    c = sub(centre, p)
-    total = 0.0
-    leaving = entering = c
-    cut = False
-    a = normalize(_corner(c, x, y, 0, sides))
-    for k in range(sides):
-        b = normalize(_corner(c, x, y, k + 1, sides))
-        ha, hb = dot(a, n), dot(b, n)
-        start, end = a, b
-        if (ha > 0.0) != (hb > 0.0):
-            crossing = normalize(lerp(a, b, ha / (ha - hb)))
-            cut = True
-            if ha > 0.0:
-                end = leaving = crossing
-            else:
-                start = entering = crossing
-        if ha > 0.0 or hb > 0.0:
-            total += _polygon_edge(start, end, n)
-        a = b
-    if cut:
-        total += _polygon_edge(leaving, entering, n)
-    return abs(total) * 0.5
-
-
-@inlined
-def _sphere_irradiance(p, n, centre, radius):  # type: ignore[no-untyped-def]
-    """Irradiance per radiance of a sphere, horizon included (Snyder 1996; Lagarde and de Rousiers 2014, listing 7)."""
-    c = sub(centre, p)
-    d2 = dot(c, c)
-    if d2 <= radius * radius:
-        return math.pi
-    cos_t = dot(c, n) / math.sqrt(d2)
-    h2 = d2 / (radius * radius)
-    if cos_t * cos_t * h2 > 1.0:
-        return math.pi * max(cos_t, 0.0) / h2
-    sin_t = math.sqrt(max(1e-12, 1.0 - cos_t * cos_t))
-    a = math.sqrt(h2 - 1.0)
-    b = -a * cos_t / sin_t
-    b = min(1.0, max(-1.0, b))
-    side = math.sqrt(1.0 - b * b)
-    return max(0.0, (cos_t * math.acos(b) - a * sin_t * side) / h2 + math.atan(sin_t * side / a))
-
-
-@inlined
-def irradiance_factor(lights, l, p, n):  # type: ignore[no-untyped-def] # noqa: E741
-    """Unoccluded irradiance at `p` on a surface with normal `n`, per radiance of light `l` [sr]."""
-    kind = lights.kind[l]
-    axes = lights.axes[l]
-    face, centre = row(axes, 2), row(axes, 3)
-    s0 = lights.size[l, 0]
-    if kind == _DISTANT:
-        cosine = max(0.0, -dot(face, n))
-        return cosine * (math.pi * math.sin(s0) ** 2 if s0 > 0.0 else 1.0)
-    to = sub(centre, p)
-    d2 = max(dot(to, to), 1e-12)
-    cosine = max(0.0, dot(to, n)) / math.sqrt(d2)
-    if kind == CAMERA_LIGHT:
-        return cosine
-    if kind == _SPHERE:
-        return _sphere_irradiance(p, n, centre, s0) if s0 > 0.0 else cosine / d2
-    if dot(to, face) >= 0.0:
-        return 0.0  # behind a one-sided light
-    if s0 > 0.0:
-        sides = 4 if kind == _RECT else _DISK_SIDES
-        s1 = lights.size[l, 1] if kind == _RECT else s0
-        return _polygon_irradiance(p, n, centre, scale(row(axes, 0), s0), scale(row(axes, 1), s1), sides)
-    return cosine * -dot(to, face) / math.sqrt(d2) / d2
-
-
-@inlined
-def _nearest_to_mirror(lights, l, p, r):  # type: ignore[no-untyped-def] # noqa: E741
-    """(vector to the light's point nearest to ray (p, r), mirror ray hits the light, its projected solid angle,
-    its angular radius)."""
-    kind = lights.kind[l]
-    axes = lights.axes[l]
-    x, y, face, centre = row(axes, 0), row(axes, 1), row(axes, 2), row(axes, 3)
-    s0, s1 = lights.size[l, 0], lights.size[l, 1]
-    if kind == _DISTANT:
-        to = scale(face, -1.0)
-        off = sub(r, scale(to, dot(r, to)))
-        away = length(off)
-        inside = dot(r, to) > 0.0 and away <= math.sin(s0)
-        point = r if inside else add(to, scale(off, math.tan(s0) / max(away, 1e-12)))
-        return point, inside, math.pi * math.sin(s0) ** 2 if s0 > 0.0 else 1.0, s0
-    c = sub(centre, p)
-    d2 = max(dot(c, c), 1e-12)
-    if kind == _SPHERE:
-        off = sub(scale(r, dot(c, r)), c)
-        away = length(off)
-        inside = away <= s0 and dot(c, r) > 0.0
-        point = add(c, scale(off, min(1.0, s0 / max(away, 1e-12))))
-        return point, inside, math.pi * s0 * s0 / d2 if s0 > 0.0 else 1.0 / d2, s0 / math.sqrt(d2)
-    if kind == CAMERA_LIGHT:
-        return c, False, 1.0, 0.0
-    facing = -dot(c, face)
-    if facing <= 0.0:
-        return c, False, 0.0, 0.0
-    hit = c
-    toward = -dot(r, face)
-    if toward > 1e-6:
-        hit = scale(r, facing / toward)
-    off = sub(hit, c)
-    a, b = dot(off, x), dot(off, y)
-    if kind == _RECT:
-        inside = toward > 1e-6 and abs(a) <= s0 and abs(b) <= s1
-        a, b = min(s0, max(-s0, a)), min(s1, max(-s1, b))
-        area = 4.0 * s0 * s1
-    else:
-        away = math.sqrt(a * a + b * b)
-        inside = toward > 1e-6 and away <= s0
-        shrink = min(1.0, s0 / max(away, 1e-12))
-        a, b = a * shrink, b * shrink
-        area = math.pi * s0 * s0
-    point = add(c, add(scale(x, a), scale(y, b)))
-    solid = facing / math.sqrt(d2) / d2 * (area if area > 0.0 else 1.0)
-    return point, inside, solid, math.sqrt(area / math.pi / d2)
-
-
-@inlined
-def highlight(lights, l, p, n, wo, alpha):  # type: ignore[no-untyped-def] # noqa: E741
-    """Reflected radiance per radiance of light `l`, without Fresnel and shadow, for a GGX surface of width alpha."""
+    A mirror shows the light's own shape: 1 where the mirrored ray hits it, else 0. A rough surface sees it as one
+    direction, that of the light's point nearest to the mirrored ray, with a lobe widened by half the light's angular
+    radius and dimmed to the same energy (Karis 2013, "representative point"), times the solid angle it stands for.
+    """
     n_dot_v = dot(n, wo)
     if n_dot_v <= 0.0:
         return 0.0
     r = sub(scale(n, 2.0 * n_dot_v), wo)
-    point, inside, solid, radius = _nearest_to_mirror(lights, l, p, r)
+    point, inside, solid, radius = _nearest(lights.kind[which], _lamp(lights, which), p, r)
     if solid <= 0.0:
         return 0.0
     # Sharp surfaces show the light's own shape, rough ones its blur; in between both, so that there is no step.
@@ -275,3 +148,309 @@ def highlight(lights, l, p, n, wo, alpha):  # type: ignore[no-untyped-def] # noq
             lobe = ggx(dot(n, h), a) * (a / wide) ** 2 * smith_visibility(n_dot_v, n_dot_l, a)
             value += (1.0 - sharp) * lobe * n_dot_l * solid
     return value
+
+
+# --- shadow targets -------------------------------------------------------------------------------------------------
+
+
+@inlined
+def _towards(p: Vec, target: Vec) -> tuple[Vec, float]:
+    d = sub(target, p)
+    distance = length(d)
+    return scale(d, 1.0 / max(distance, 1e-12)), distance
+
+
+@inlined
+def _on_disk(centre: Vec, x: Vec, y: Vec, radius: float, u1: float, u2: float) -> Vec:
+    """A point spread evenly over a disk's area, for which its distance from the middle grows as a square root."""
+    r = radius * math.sqrt(u1)
+    phi = 2.0 * math.pi * u2
+    return add(centre, add(scale(x, r * math.cos(phi)), scale(y, r * math.sin(phi))))
+
+
+@inlined
+def _distant_target(lamp: Lamp, p: Vec, u1: float, u2: float) -> tuple[Vec, float]:
+    """Within the cone of half angle `a`; no point of it is any nearer than another."""
+    to = scale(lamp.face, -1.0)
+    if lamp.a > 0.0:
+        r = math.sin(lamp.a) * math.sqrt(u1)
+        phi = 2.0 * math.pi * u2
+        to = normalize(add(to, add(scale(lamp.x, r * math.cos(phi)), scale(lamp.y, r * math.sin(phi)))))
+    return to, math.inf
+
+
+@inlined
+def _sphere_target(lamp: Lamp, p: Vec, u1: float, u2: float) -> tuple[Vec, float]:
+    """On the disk through its middle that it shows to `p`."""
+    target = lamp.centre
+    if lamp.a > 0.0:
+        x, y = frame(normalize(sub(p, lamp.centre)))
+        target = _on_disk(lamp.centre, x, y, lamp.a, u1, u2)
+    return _towards(p, target)
+
+
+@inlined
+def _rect_target(lamp: Lamp, p: Vec, u1: float, u2: float) -> tuple[Vec, float]:
+    across = add(scale(lamp.x, (2.0 * u1 - 1.0) * lamp.a), scale(lamp.y, (2.0 * u2 - 1.0) * lamp.b))
+    return _towards(p, add(lamp.centre, across))
+
+
+@inlined
+def _disk_target(lamp: Lamp, p: Vec, u1: float, u2: float) -> tuple[Vec, float]:
+    target = lamp.centre
+    if lamp.a > 0.0:
+        target = _on_disk(lamp.centre, lamp.x, lamp.y, lamp.a, u1, u2)
+    return _towards(p, target)
+
+
+@inlined
+def _camera_target(lamp: Lamp, p: Vec, u1: float, u2: float) -> tuple[Vec, float]:
+    return _towards(p, lamp.centre)
+
+
+# --- irradiance -----------------------------------------------------------------------------------------------------
+
+
+@inlined
+def _place(lamp: Lamp, p: Vec, n: Vec) -> tuple[Vec, float, float]:
+    """Vector to the middle [m], its square [m^2], and the receiver's cosine to it, 0 below the horizon."""
+    to = sub(lamp.centre, p)
+    d2 = max(dot(to, to), _NEAREST2)
+    return to, d2, max(0.0, dot(to, n)) / math.sqrt(d2)
+
+
+@inlined
+def _distant_irradiance(lamp: Lamp, p: Vec, n: Vec) -> float:
+    """A cone of half angle a has the projected solid angle pi sin^2 a cos t. At the horizon it is not clipped: of the
+    sun that half is a quarter of a degree."""
+    cosine = max(0.0, -dot(lamp.face, n))
+    return cosine * (math.pi * math.sin(lamp.a) ** 2 if lamp.a > 0.0 else 1.0)
+
+
+@inlined
+def _sphere_irradiance(lamp: Lamp, p: Vec, n: Vec) -> float:
+    """Horizon included (Snyder 1996; Lagarde and de Rousiers 2014, listing 7). Of a point, intensity over distance
+    squared."""
+    c, d2, cosine = _place(lamp, p, n)
+    if lamp.a <= 0.0:
+        return cosine / d2
+    return _ball_irradiance(c, n, lamp.a)
+
+
+@inlined
+def _ball_irradiance(c: Vec, n: Vec, radius: float) -> float:
+    """Irradiance per radiance of a ball whose middle is `c` away [m]."""
+    d2 = dot(c, c)
+    if d2 <= radius * radius:  # inside it everything shines
+        return math.pi
+    cos_t = dot(c, n) / math.sqrt(d2)
+    h2 = d2 / (radius * radius)
+    if cos_t * cos_t * h2 > 1.0:  # the horizon does not cut it: the whole disk that it shows, or nothing of it
+        return math.pi * max(cos_t, 0.0) / h2
+    sin_t = math.sqrt(max(1e-12, 1.0 - cos_t * cos_t))
+    a = math.sqrt(h2 - 1.0)
+    b = -a * cos_t / sin_t
+    b = min(1.0, max(-1.0, b))
+    side = math.sqrt(1.0 - b * b)
+    return max(0.0, (cos_t * math.acos(b) - a * sin_t * side) / h2 + math.atan(sin_t * side / a))
+
+
+@inlined
+def _rect_irradiance(lamp: Lamp, p: Vec, n: Vec) -> float:
+    return _flat_irradiance(lamp, p, n, lamp.b, 4)
+
+
+@inlined
+def _disk_irradiance(lamp: Lamp, p: Vec, n: Vec) -> float:
+    return _flat_irradiance(lamp, p, n, lamp.a, _DISK_SIDES)
+
+
+@inlined
+def _flat_irradiance(lamp: Lamp, p: Vec, n: Vec, half_height: float, sides: int) -> float:
+    """A flat light shines to one side. Without size it is a point whose intensity falls with its own cosine."""
+    to, d2, cosine = _place(lamp, p, n)
+    if dot(to, lamp.face) >= 0.0:  # behind it
+        return 0.0
+    if lamp.a > 0.0:
+        return _polygon_irradiance(p, n, lamp.centre, scale(lamp.x, lamp.a), scale(lamp.y, half_height), sides)
+    return cosine * -dot(to, lamp.face) / math.sqrt(d2) / d2
+
+
+@inlined
+def _angle_over_sine(x: float) -> float:
+    """acos(x) / sqrt(1 - x * x) for x in 0 .. 1, where it is 1 at the end, to 1e-7 of it: a Chebyshev fit, in an order
+    without a long chain. A call of acos takes longer than all the rest of an edge."""
+    x2 = x * x
+    low = (1.5707962222 - 0.99998225999 * x) + (0.78489625578 - 0.66108945254 * x) * x2
+    high = (0.55702205608 - 0.4245661869 * x) + (0.25323847676 - 0.097968704053 * x) * x2
+    return low + (high + 0.017653667906 * (x2 * x2)) * (x2 * x2)
+
+
+@inlined
+def _polygon_edge(a: Vec, b: Vec, n: Vec) -> float:
+    """One edge of Lambert's formula for two unit directions and the receiver's normal: the angle between the two, times
+    the cosine of the receiver to the plane that they span."""
+    cosine = min(1.0, max(-1.0, dot(a, b)))
+    axis = cross(a, b)
+    across = dot(axis, n)
+    angle = _angle_over_sine(abs(cosine))
+    if cosine >= 0.0:
+        return angle * across
+    sine = length(axis)  # past a right angle: acos(-x) = pi - acos(x)
+    return (math.pi / sine - angle) * across if sine > 1e-9 else 0.0
+
+
+@inlined
+def _corner(c: Vec, x: Vec, y: Vec, k: int, sides: int) -> Vec:
+    """Corner `k` of the parallelogram with half axes x, y, or of the regular polygon with the area of their ellipse."""
+    if sides == 4:
+        sx = 1.0 if k % 4 == 1 or k % 4 == 2 else -1.0
+        sy = 1.0 if k % 4 == 2 or k % 4 == 3 else -1.0
+        return add(add(c, scale(x, sx)), scale(y, sy))
+    step = 2.0 * math.pi / sides
+    grow = math.sqrt(step / math.sin(step))
+    return add(add(c, scale(x, grow * math.cos(step * k))), scale(y, grow * math.sin(step * k)))
+
+
+@inlined
+def _polygon_irradiance(p: Vec, n: Vec, centre: Vec, x: Vec, y: Vec, sides: int) -> float:
+    """Irradiance per radiance of a flat light, clipped at the receiver's horizon
+    (Lambert 1760; Baum, Rushmeier and Winget 1989)."""
+    c = sub(centre, p)
+    total = 0.0
+    leaving = entering = c
+    cut = False
+    a = normalize(_corner(c, x, y, 0, sides))
+    for k in range(sides):
+        b = normalize(_corner(c, x, y, k + 1, sides))
+        ha, hb = dot(a, n), dot(b, n)
+        start, end = a, b
+        if (ha > 0.0) != (hb > 0.0):  # the horizon cuts this edge: the part above it counts
+            crossing = normalize(lerp(a, b, ha / (ha - hb)))
+            cut = True
+            if ha > 0.0:
+                end = leaving = crossing
+            else:
+                start = entering = crossing
+        if ha > 0.0 or hb > 0.0:
+            total += _polygon_edge(start, end, n)
+        a = b
+    if cut:  # the edge along the horizon, which closes what is left of the polygon
+        total += _polygon_edge(leaving, entering, n)
+    return abs(total) * 0.5
+
+
+@inlined
+def _camera_irradiance(lamp: Lamp, p: Vec, n: Vec) -> float:
+    """As if it were equally near to everything: the picture of a stage without lights has no bright middle."""
+    _, _, cosine = _place(lamp, p, n)
+    return cosine
+
+
+# --- the point of a light for its highlight -------------------------------------------------------------------------
+
+
+Nearest = tuple[Vec, bool, float, float]
+"""Vector to the light's point nearest to the mirrored ray [m] (of a distant light, a direction), whether that ray hits
+the light, the solid angle the light fills [sr] (of a flat one, with its own cosine; without size, 1 over what its
+limit is divided by), and its angular radius [rad], about."""
+
+
+@inlined
+def _distant_nearest(lamp: Lamp, p: Vec, r: Vec) -> Nearest:
+    to = scale(lamp.face, -1.0)
+    off = sub(r, scale(to, dot(r, to)))
+    away = length(off)
+    inside = dot(r, to) > 0.0 and away <= math.sin(lamp.a)
+    point = r if inside else add(to, scale(off, math.tan(lamp.a) / max(away, 1e-12)))
+    return point, inside, math.pi * math.sin(lamp.a) ** 2 if lamp.a > 0.0 else 1.0, lamp.a
+
+
+@inlined
+def _sphere_nearest(lamp: Lamp, p: Vec, r: Vec) -> Nearest:
+    """From its middle towards the ray, as far as the ray or the sphere reaches (Karis 2013)."""
+    c = sub(lamp.centre, p)
+    d2 = max(dot(c, c), _NEAREST2)
+    off = sub(scale(r, dot(c, r)), c)
+    away = length(off)
+    inside = away <= lamp.a and dot(c, r) > 0.0
+    point = add(c, scale(off, min(1.0, lamp.a / max(away, 1e-12))))
+    solid = math.pi * lamp.a * lamp.a / d2 if lamp.a > 0.0 else 1.0 / d2
+    return point, inside, solid, lamp.a / math.sqrt(d2)
+
+
+@inlined
+def _in_plane(lamp: Lamp, c: Vec, r: Vec) -> tuple[bool, float, float]:
+    """Where a ray meets the plane of a flat light whose middle is `c` away: whether it does, and its place along the
+    light's axes [m]. A ray that leads away from the plane is answered with the light's middle."""
+    hit = c
+    toward = -dot(r, lamp.face)
+    if toward > 1e-6:
+        hit = scale(r, -dot(c, lamp.face) / toward)
+    off = sub(hit, c)
+    return toward > 1e-6, dot(off, lamp.x), dot(off, lamp.y)
+
+
+@inlined
+def _flat_nearest(lamp: Lamp, c: Vec, a: float, b: float, inside: bool, area: float) -> Nearest:
+    """The answer of a flat light for a point at (a, b) along its axes, as seen from its front; behind it, nothing."""
+    facing = -dot(c, lamp.face)
+    if facing <= 0.0:
+        return c, False, 0.0, 0.0
+    d2 = max(dot(c, c), _NEAREST2)
+    point = add(c, add(scale(lamp.x, a), scale(lamp.y, b)))
+    solid = facing / math.sqrt(d2) / d2 * (area if area > 0.0 else 1.0)
+    return point, inside, solid, math.sqrt(area / math.pi / d2)
+
+
+@inlined
+def _rect_nearest(lamp: Lamp, p: Vec, r: Vec) -> Nearest:
+    c = sub(lamp.centre, p)
+    meets, a, b = _in_plane(lamp, c, r)
+    inside = meets and abs(a) <= lamp.a and abs(b) <= lamp.b
+    a, b = min(lamp.a, max(-lamp.a, a)), min(lamp.b, max(-lamp.b, b))
+    return _flat_nearest(lamp, c, a, b, inside, 4.0 * lamp.a * lamp.b)
+
+
+@inlined
+def _disk_nearest(lamp: Lamp, p: Vec, r: Vec) -> Nearest:
+    c = sub(lamp.centre, p)
+    meets, a, b = _in_plane(lamp, c, r)
+    away = math.sqrt(a * a + b * b)
+    inside = meets and away <= lamp.a
+    shrink = min(1.0, lamp.a / max(away, 1e-12))
+    return _flat_nearest(lamp, c, a * shrink, b * shrink, inside, math.pi * lamp.a * lamp.a)
+
+
+@inlined
+def _camera_nearest(lamp: Lamp, p: Vec, r: Vec) -> Nearest:
+    return sub(lamp.centre, p), False, 1.0, 0.0
+
+
+# --- one row per kind -----------------------------------------------------------------------------------------------
+
+
+class Kind(NamedTuple):
+    """How lights of one kind shine."""
+
+    target: Callable[[Lamp, Vec, float, float], tuple[Vec, float]]
+    """as `shadow_ray`"""
+    irradiance: Callable[[Lamp, Vec, Vec], float]
+    """as `irradiance_factor`"""
+    nearest: Callable[[Lamp, Vec, Vec], Nearest]
+    """(lamp, point, mirrored direction) -> as `Nearest`"""
+    size_factor: float = 1.0
+    """`LightTable.size` of `scene.Light.size`: rectangles and cones are measured from their middle."""
+
+
+KINDS = {
+    LightKind.DISTANT: Kind(_distant_target, _distant_irradiance, _distant_nearest, 0.5),
+    LightKind.SPHERE: Kind(_sphere_target, _sphere_irradiance, _sphere_nearest),
+    LightKind.RECT: Kind(_rect_target, _rect_irradiance, _rect_nearest, 0.5),
+    LightKind.DISK: Kind(_disk_target, _disk_irradiance, _disk_nearest),
+    LightKind.CAMERA: Kind(_camera_target, _camera_irradiance, _camera_nearest),
+}
+_CAMERA = KINDS[LightKind.CAMERA]
+_target = choice({kind: one.target for kind, one in KINDS.items()}, _CAMERA.target)
+_irradiance = choice({kind: one.irradiance for kind, one in KINDS.items()}, _CAMERA.irradiance)
+_nearest = choice({kind: one.nearest for kind, one in KINDS.items()}, _CAMERA.nearest)

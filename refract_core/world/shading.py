@@ -19,7 +19,7 @@ from ..optics.lobes import MIRROR_ALPHA, sample_half_vector, specular_albedo
 from ..scene import Param
 from .embree import SCATTERED, Packet, clear, has_hit, ray_direction, set_ray
 from .environment import irradiance, prefiltered, sample_direction
-from .lights import CAMERA_LIGHT, LightTable, highlight, irradiance_factor, shadow_ray
+from .lights import LightTable, highlight, irradiance_factor, shadow_ray
 from .offsets import off_surface
 from .surface import Interaction, color_input, float_input, hit_in, interaction, normal_input, share_input
 from .tables import World
@@ -176,11 +176,11 @@ def _gather_lights(block: Block, packet: Packet, world: World, sample: int, mask
             gloss = block.roughness[lane]
             block.lamp_specular[lane] = highlight(lights, l, p, n, wo, gloss * gloss) * lights.specular[l]
             arrives = block.lamp_diffuse[lane] + block.lamp_specular[lane] > 0.0
-            if arrives and lights.kind[l] != CAMERA_LIGHT:
+            if arrives and lights.casts_shadow[l] != 0:
                 u1, u2 = unit_pair(key_of(block.key, lane), sample, Purpose.LIGHT.value + l)
                 direction, distance = shadow_ray(lights, l, p, u1, u2)
                 add_shadow_ray(packet, lane, p, row(block.ng, lane), direction, distance)
-        if lights.kind[l] != CAMERA_LIGHT:
+        if lights.casts_shadow[l] != 0:
             visible(packet, world, mask, block.lamp_seen)
         _add_light(block, lights, l)
 

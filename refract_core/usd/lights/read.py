@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,12 +12,6 @@ from pxr import Usd, UsdGeom, UsdLux
 from ...scene import F64, Environment, Light, LightKind, Notice
 from .domes import Dome, read_dome, rotation, sum_domes
 
-_KINDS = {
-    "DistantLight": LightKind.DISTANT,
-    "SphereLight": LightKind.SPHERE,
-    "RectLight": LightKind.RECT,
-    "DiskLight": LightKind.DISK,
-}
 _DOMES = ("DomeLight", "DomeLight_1")
 _KELVIN = (1000.0, 10000.0)
 
@@ -80,7 +75,7 @@ def read_lights(
 def _read_light(context: Context, prim: Usd.Prim, lights: list[Light], domes: list[Dome]) -> None:
     """Add one light prim to `lights` or `domes`, or a notice."""
     name = str(prim.GetTypeName())
-    if name not in _KINDS and name not in _DOMES:
+    if name not in ROWS and name not in _DOMES:
         label = "MeshLightAPI" if prim.HasAPI(UsdLux.MeshLightAPI) else name or "LightAPI"
         hint = " (sampling of the dome goes on without it)" if name == "PortalLight" else ""
         _note(context, prim, f"{label} is ignored: it is not rendered as a light{hint}")
@@ -101,14 +96,15 @@ def _read_light(context: Context, prim: Usd.Prim, lights: list[Light], domes: li
         if dome is not None:
             domes.append(dome)
         return
-    shape = _SHAPES[_KINDS[name]](context, prim, world_from_light)
+    row = ROWS[name]
+    shape = row.read(context, prim, world_from_light)
     if shape is None:
         return
     r, g, b = (value * shape.factor for value in emission)
     lights.append(
         Light(
             path=str(prim.GetPath()),
-            kind=_KINDS[name],
+            kind=row.kind,
             radiance=(r, g, b),
             world_from_light=shape.world_from_light,
             size=shape.size,
@@ -276,12 +272,26 @@ def _distant(context: Context, prim: Usd.Prim, matrix: F64) -> Shape | None:
     return Shape(_frame(matrix), (2.0 * half, 0.0), 1.0 / size_factor if normalize else 1.0)
 
 
-_SHAPES = {
-    LightKind.SPHERE: _sphere,
-    LightKind.RECT: _rect,
-    LightKind.DISK: _disk,
-    LightKind.DISTANT: _distant,
+class Row(NamedTuple):
+    """How lights of one kind are read."""
+
+    kind: LightKind
+    read: Callable[[Context, Usd.Prim, F64], Shape | None]
+    """(context, prim, engine world from light) -> place and size; None with a notice where it gives no light"""
+    cone: float
+    """Half angle of the cone it shines into by itself [degrees]: a narrower one cuts something off."""
+
+
+ROWS = {
+    row.kind.usd_type: row
+    for row in (
+        Row(LightKind.DISTANT, _distant, 90.0),
+        Row(LightKind.SPHERE, _sphere, 180.0),
+        Row(LightKind.RECT, _rect, 90.0),
+        Row(LightKind.DISK, _disk, 90.0),
+    )
 }
+"""By the prims' type."""
 
 
 # --- what is ignored ------------------------------------------------------------------------------------------------
@@ -295,9 +305,8 @@ def _note_ignored(context: Context, prim: Usd.Prim) -> None:
 
 def _ignored_shaping(context: Context, prim: Usd.Prim) -> list[str]:
     found = []
-    # Below this the cone cuts something off: area and distant lights shine into one half only.
-    whole = 180.0 if prim.GetTypeName() == "SphereLight" else 90.0
-    if float(_value(context, prim, "inputs:shaping:cone:angle", 180.0)) < whole:
+    row = ROWS.get(str(prim.GetTypeName()))
+    if float(_value(context, prim, "inputs:shaping:cone:angle", 180.0)) < (row.cone if row else 90.0):
         found.append("inputs:shaping:cone:angle")
     if float(_value(context, prim, "inputs:shaping:focus", 0.0)) > 0.0:
         found.append("inputs:shaping:focus")
@@ -330,7 +339,7 @@ def _ignored_inputs(context: Context, prim: Usd.Prim) -> list[str]:
     if any(float(c) != 0.0 for c in _value(context, prim, "inputs:shadow:color", (0.0, 0.0, 0.0))):
         found.append("inputs:shadow:color")
     asset = _value(context, prim, "inputs:texture:file", None)
-    if prim.GetTypeName() == "RectLight" and asset is not None and asset.path:
+    if prim.GetTypeName() not in _DOMES and asset is not None and asset.path:
         found.append("inputs:texture:file")
     if prim.GetTypeName() in _DOMES:
         for name in ("inputs:diffuse", "inputs:specular"):
