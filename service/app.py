@@ -195,6 +195,10 @@ def _add_pages(app: FastAPI, settings: Settings, metrics: Metrics) -> None:
             raise Problem("not-found", "there is no such type of problem")
         return HTMLResponse(pages.problem_page(slug))
 
+    @app.get("/static/words.js", include_in_schema=False)
+    async def words() -> Response:
+        return Response(pages.words(), media_type="text/javascript", headers={"Cache-Control": "no-cache"})
+
     @app.get("/", include_in_schema=False)
     async def front() -> HTMLResponse:
         page = _STATIC / "index.html"

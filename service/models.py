@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
-Model = Literal["none", "sphere", "box", "thin", "traced"]
+from refract_core.models import MODELS
+
+if TYPE_CHECKING:
+    Model = str
+else:
+    Model = Literal[MODELS]
 Tier = Literal["screen", "ray", "probe", "sky"]
 Purpose = Literal["default", "render", "proxy", "guide"]
 Aov = Literal[

@@ -1,10 +1,13 @@
-"""Pages without scripts: /docs from the OpenAPI document, and one page per problem type."""
+"""The words the page knows, and pages without scripts: /docs from the OpenAPI document, and one per problem type."""
 
 from __future__ import annotations
 
 import json
 from html import escape
 from typing import Any
+
+from refract_core.models import MODELS, Model
+from refract_core.settings import SCREEN_METHODS, TIERS
 
 from .limits import Limits, table
 from .problems import KINDS
@@ -13,6 +16,16 @@ _HEAD = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="view
 <title>{title}</title><link rel="stylesheet" href="/static/page.css"><main>
 <h1>{title}</h1>
 """
+
+
+def words() -> str:
+    """The engine's words as a module of the page's script, `/static/words.js`: nothing is written there twice."""
+    told = {
+        "TIERS": TIERS, "SCREENS": SCREEN_METHODS, "MODELS": MODELS,
+        "MODEL_HELP": {model.token: model.row.help for model in Model},
+    }  # fmt: skip
+    lines = [f"export const {name} = {json.dumps(value)};" for name, value in told.items()]
+    return "\n".join(["// The engine's own words.", "", *lines, ""])
 
 
 def problem_page(slug: str) -> str:

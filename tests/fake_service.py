@@ -19,6 +19,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+from service import pages
+
 STATIC = Path(__file__).parents[1] / "service" / "static"
 TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 ENDED = ("done", "failed", "cancelled")
@@ -139,6 +141,8 @@ class Handler(BaseHTTPRequestHandler):
         path = self.path.partition("?")[0]
         if path == "/":
             path = "/static/index.html"
+        if path == "/static/words.js":
+            return self.reply(200, pages.words().encode(), TYPES[".js"])
         if path.startswith("/static/"):
             file = STATIC / path.rpartition("/")[2]
             return self.reply(200, file.read_bytes(), TYPES[file.suffix])

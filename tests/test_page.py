@@ -18,10 +18,12 @@ from fake_service import Job
 
 from refract_core.images.aovs import AOVS
 from refract_core.settings import MODELS, SCREEN_METHODS, TIERS, RenderSettings
+from service import pages
 
 STATIC = Path(__file__).parents[1] / "service" / "static"
 MARKUP = (STATIC / "index.html").read_text("utf-8")
 MODULES = {path.name: path.read_text("utf-8") for path in sorted(STATIC.glob("*.js"))}
+MODULES["words.js"] = pages.words()
 SCRIPT = "\n".join(MODULES.values())
 STYLE = (STATIC / "page.css").read_text("utf-8")
 FACTS = {"up_axis": "Z", "metres_per_unit": 0.01, "settings": {"tiers": ["screen", "probe", "sky"], "samples": 4}}

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from ..models import MODELS
 from ..verbs.convert import Converted, ConvertOrder, Row, convert
 from .app import ProgressMode, app, outcome, words
 
@@ -29,7 +30,7 @@ Flatten = Annotated[
 ModelName = Annotated[
     str,
     typer.Option(
-        "--model", metavar="none|sphere|box|thin|traced", help="Use this model for all glass, whatever its shape."
+        "--model", metavar="|".join(MODELS), help="Use this model for all glass, whatever its shape."
     ),
 ]
 Only = Annotated[

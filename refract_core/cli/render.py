@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from ..errors import UsageError
+from ..models import MODELS, explained
 from ..verbs.executors import crew_at
 from ..verbs.override import COLORS, RANGES
 from ..verbs.render_files import Order, render_files
@@ -59,8 +60,8 @@ ModelName = Annotated[
     str | None,
     typer.Option(
         "--model",
-        metavar="none|sphere|box|thin|traced",
-        help="Use this refraction model for every refractive material, whatever the stage says.",
+        metavar="|".join(MODELS),
+        help=f"Use this refraction model for every refractive material, whatever the stage says: {explained()}.",
     ),
 ]
 Override = Annotated[

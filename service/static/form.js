@@ -3,9 +3,10 @@
 import { $, make } from "./dom.js";
 import { drawGlass, showGlass } from "./glass.js";
 import { changed, renderAll, stop } from "./jobs.js";
-import { MODELS, NUMBERS } from "./settings.js";
+import { NUMBERS } from "./settings.js";
 import { SIDES, state, tell, update } from "./state.js";
 import { drawTiers } from "./tiers.js";
+import { MODELS, MODEL_HELP } from "./words.js";
 
 /** Controls that depend on what is in the stage; without one, none. */
 export function drawChoices() {
@@ -68,7 +69,7 @@ export function wireSettings() {
     $(`set-${name}`).onblur = showSettings;
   }
   for (const name of ["camera", "screen", "model"]) $(`set-${name}`).onchange = ({ target }) => update({ [name]: target.value });
-  $("set-model").append(...MODELS.map((model) => make("option", { value: model, textContent: model })));
+  $("set-model").append(...MODELS.map((model) => make("option", { value: model, textContent: model, title: MODEL_HELP[model] })));
   $("compare").onchange = ({ target }) => {
     if (target.checked) state.settings.b = copyOf(state.settings.a);
     state.edit = target.checked ? "b" : "a";

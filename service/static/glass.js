@@ -1,7 +1,7 @@
 // The controls of the glass in the stage, one group per material.
 
 import { $, make } from "./dom.js";
-import { MODELS } from "./settings.js";
+import { MODELS } from "./words.js";
 import { state, update } from "./state.js";
 
 /** A colour picker's #rrggbb (sRGB) as linear numbers, and back. */

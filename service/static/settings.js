@@ -1,8 +1,7 @@
-// What may be asked of a render: the words, what is usual, and what of a stranger's settings is kept.
+// What may be asked of a render: what is usual, and what of a stranger's settings is kept.
 
-export const TIERS = ["screen", "ray", "probe", "sky"];
-export const MODELS = ["none", "sphere", "box", "thin", "traced"];
-export const SCREENS = ["march", "proxy"];
+import { MODELS, SCREENS, TIERS } from "./words.js";
+
 export const NUMBERS = ["image_width", "image_height", "samples", "max_layers", "exposure", "time_code"];
 const GLASS_NUMBERS = ["ior", "thickness", "roughness", "absorptionDistance"];
 

@@ -1,7 +1,7 @@
 // The list of tiers, in the order in which they are asked.
 
 import { $, make } from "./dom.js";
-import { TIERS } from "./settings.js";
+import { TIERS } from "./words.js";
 import { update } from "./state.js";
 
 export function drawTiers(chosen) {
