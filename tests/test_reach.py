@@ -13,7 +13,7 @@ F64 = NDArray[np.float64]
 
 
 @kernel
-def _walk(cuts, sets, p, out):  # type: ignore[no-untyped-def]
+def _walk(cuts: F64, sets: NDArray[np.int64], p: F64, out: NDArray[np.int64]) -> int:
     i, j, m = piece_of(cuts, 0, p[0]), piece_of(cuts, 1, p[1]), piece_of(cuts, 2, p[2])
     count = 0
     k = next_of(sets, i, j, m, 0)

@@ -80,13 +80,25 @@ def new_lanes(record: type[R]) -> R:
 _THREAD = threading.local()
 
 
-def scratch(record: type[Any]) -> Pointer:
-    """The calling thread's own record of this type, made once per thread."""
+def by_address(record: R) -> R:
+    """A record as a kernel takes it: a `Pointer` to it.
+
+    It is typed as the record, because that is what the kernel reads: `def peel(view: View)` is called with
+    `by_address(view)`, and a checker sees whether the record is the right one. Python itself reads the record it came
+    from, not this.
+    """
+    pointer: Any = Pointer(record)
+    typed: R = pointer
+    return typed
+
+
+def scratch(record: type[R]) -> R:
+    """The calling thread's own record of this type, by address, made once per thread."""
     if not hasattr(_THREAD, "kept"):
         _THREAD.kept = {}
     if record not in _THREAD.kept:
-        _THREAD.kept[record] = Pointer(new_lanes(record))
-    found: Pointer = _THREAD.kept[record]
+        _THREAD.kept[record] = by_address(new_lanes(record))
+    found: R = _THREAD.kept[record]
     return found
 
 

@@ -85,14 +85,16 @@ def branched(key: Key, step: int) -> Key:
 
 
 @inlined
-def hash32(x: int, y: int, z: int) -> int:
-    """Thirty-two well mixed bits of three integers."""
+def hash32(x: int, y: int, z: int) -> np.uint32:
+    """Thirty-two well mixed bits of three integers; of each the lowest 32 count."""
+    # Three odd factors spread the inputs over the word; one step of PCG's generator and its output permutation then
+    # mix high bits into low ones, which a product alone never does.
     state = np.uint32(np.uint32(x) * np.uint32(0x8DA6B343) + np.uint32(y) * np.uint32(0xD8163841))
     state = np.uint32(state + np.uint32(z) * np.uint32(0xCB1AB31F))
     state = np.uint32(state * np.uint32(747796405) + np.uint32(2891336453))
     word = np.uint32((state >> ((state >> np.uint32(28)) + np.uint32(4))) ^ state)
     word = np.uint32(word * np.uint32(277803737))
-    return np.uint32((word >> np.uint32(22)) ^ word)  # type: ignore[return-value]
+    return np.uint32((word >> np.uint32(22)) ^ word)
 
 
 @inlined
@@ -103,7 +105,11 @@ def chance_of_bits(a: int, b: int, c: int) -> float:
 
 @inlined
 def unit_pair(key: Key, sample: int, purpose: int) -> tuple[float, float]:
-    """Point `sample` of the key's rotated R2 sequence in [0, 1)^2, for one `Purpose`."""
+    """Point `sample` of the key's rotated R2 sequence in [0, 1)^2, for one `Purpose`.
+
+    Each dimension turns the sequence by an amount of its own: without that a pixel's light and its lobe would be drawn
+    at the same place of their squares, sample by sample, and their product would not average out.
+    """
     dimension = _PURPOSES * key.branch + purpose
     u = hash32(key.x, key.y, 2 * dimension) * _TO_UNIT + sample * _A1
     v = hash32(key.x, key.y, 2 * dimension + 1) * _TO_UNIT + sample * _A2

@@ -1,10 +1,16 @@
-"""Three-vectors for kernels: plain tuples (x, y, z) of floats, which compile to registers."""
+"""Three-vectors for kernels: plain tuples (x, y, z) of floats, which compile to registers.
+
+Every component is float64. Tables are float32 where that is enough to keep a number, never where one is computed with:
+what comes out of a table is widened at the door (`row`).
+"""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .compile import inlined
 
@@ -77,14 +83,16 @@ def flip_towards(n: Vec, w: Vec) -> Vec:
 
 
 @inlined
-def row(a, i):  # type: ignore[no-untyped-def]
+def row(a: NDArray[Any], i: int) -> Vec:
     """Row `i` of an (N, 3) array as a tuple of float64."""
+    # Not `float()`: numba leaves a float32 what it is there, and every function that follows would be compiled twice.
     return (np.float64(a[i, 0]), np.float64(a[i, 1]), np.float64(a[i, 2]))
 
 
 @inlined
 def frame(n: Vec) -> tuple[Vec, Vec]:
     """Two unit vectors that make a right-handed frame with unit `n` (Duff et al., JCGT 6(1) 2017)."""
+    # The sign, rather than a test of n.z, keeps the division away from 0 for every direction, and -0 on its own side.
     sign = math.copysign(1.0, n[2])
     a = -1.0 / (sign + n[2])
     b = n[0] * n[1] * a
@@ -92,8 +100,8 @@ def frame(n: Vec) -> tuple[Vec, Vec]:
 
 
 @inlined
-def transform_direction(m, d):  # type: ignore[no-untyped-def]
-    """Upper 3x3 of a matrix array times a vector."""
+def transform_direction(m: NDArray[Any], d: Vec) -> Vec:
+    """Upper 3x3 of a matrix array times a vector. A normal comes out right only where the matrix keeps angles."""
     return (
         m[0, 0] * d[0] + m[0, 1] * d[1] + m[0, 2] * d[2],
         m[1, 0] * d[0] + m[1, 1] * d[1] + m[1, 2] * d[2],
@@ -102,7 +110,7 @@ def transform_direction(m, d):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def transform_point(m, p):  # type: ignore[no-untyped-def]
+def transform_point(m: NDArray[Any], p: Vec) -> Vec:
     """A 4x4 matrix array (column vectors, affine) times a point."""
     return (
         m[0, 0] * p[0] + m[0, 1] * p[1] + m[0, 2] * p[2] + m[0, 3],

@@ -6,11 +6,12 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from ..kernels.compile import inlined
-from ..kernels.vec import add, cross, dot, frame, normalize, scale
+from ..kernels.vec import Vec, add, cross, dot, frame, normalize, scale
 
 MIRROR_ALPHA = 1e-3
 """Below this width a lobe is treated as a perfect mirror."""
@@ -42,8 +43,21 @@ _ALBEDO_B = (
 _ALBEDO = np.array([_ALBEDO_A, _ALBEDO_B])
 
 
+class Cone(NamedTuple):
+    """A ray that stands for a rough lobe of rays: what asks the screen or a probe, whose pictures are filtered."""
+
+    origin: Vec
+    """[m]"""
+    direction: Vec
+    """unit, the lobe's axis"""
+    blur: float
+    """tangent of the half angle within which the lobe keeps half of its rays"""
+    roughness: float
+    """perceptual, for HDRP's own mappings of roughness to levels, which know no angle"""
+
+
 @inlined
-def ggx(n_dot_h, alpha):  # type: ignore[no-untyped-def]
+def ggx(n_dot_h: float, alpha: float) -> float:
     """Normal distribution D (Walter et al. 2007, eq. 33)."""
     a2 = alpha * alpha
     d = n_dot_h * n_dot_h * (a2 - 1.0) + 1.0
@@ -51,8 +65,9 @@ def ggx(n_dot_h, alpha):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def smith_visibility(n_dot_v, n_dot_l, alpha):  # type: ignore[no-untyped-def]
+def smith_visibility(n_dot_v: float, n_dot_l: float, alpha: float) -> float:
     """G2 / (4 n.v n.l), height-correlated (Heitz 2014, eq. 99)."""
+    # The cosines of the microfacet denominator are already divided out here: both vanish at grazing angles.
     a2 = alpha * alpha
     v = n_dot_l * math.sqrt(n_dot_v * n_dot_v * (1.0 - a2) + a2)
     l = n_dot_v * math.sqrt(n_dot_l * n_dot_l * (1.0 - a2) + a2)  # noqa: E741
@@ -60,8 +75,9 @@ def smith_visibility(n_dot_v, n_dot_l, alpha):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def sample_half_vector(n, wo, alpha, u1, u2):  # type: ignore[no-untyped-def]
-    """A microfacet normal among those visible from `wo` (Heitz, JCGT 7(4) 2018)."""
+def sample_half_vector(n: Vec, wo: Vec, alpha: float, u1: float, u2: float) -> Vec:
+    """A microfacet normal among those visible from `wo` (Heitz, JCGT 7(4) 2018). `u1`, `u2`: a point of [0, 1)^2."""
+    # Stretched by alpha, the ellipsoid of microfacets becomes the unit hemisphere, seen along v.
     x, y = frame(n)
     v = normalize((alpha * dot(wo, x), alpha * dot(wo, y), dot(wo, n)))
     squared = v[0] * v[0] + v[1] * v[1]
@@ -71,6 +87,7 @@ def sample_half_vector(n, wo, alpha, u1, u2):  # type: ignore[no-untyped-def]
     else:
         t1 = (1.0, 0.0, 0.0)
     t2 = cross(v, t1)
+    # What v sees of the hemisphere is a disk, half of it foreshortened: a point of that disk, then up to the sphere.
     r = math.sqrt(u1)
     phi = 2.0 * math.pi * u2
     p1 = r * math.cos(phi)
@@ -78,13 +95,15 @@ def sample_half_vector(n, wo, alpha, u1, u2):  # type: ignore[no-untyped-def]
     p2 = (1.0 - s) * math.sqrt(max(0.0, 1.0 - p1 * p1)) + s * r * math.sin(phi)
     p3 = math.sqrt(max(0.0, 1.0 - p1 * p1 - p2 * p2))
     h = add(add(scale(t1, p1), scale(t2, p2)), scale(v, p3))
+    # Back from the hemisphere to the ellipsoid: normals shrink where points were stretched.
     h = normalize((alpha * h[0], alpha * h[1], max(1e-6, h[2])))
     return normalize(add(add(scale(x, h[0]), scale(y, h[1])), scale(n, h[2])))
 
 
 @inlined
-def directional_albedo(n_dot_v, roughness):  # type: ignore[no-untyped-def]
-    """(A, B) with reflectance = F0 * A + B: the split-sum integral of single-scattering GGX."""
+def directional_albedo(n_dot_v: float, roughness: float) -> tuple[float, float]:
+    """(A, B) with reflectance = F0 * A + B: the split-sum integral of single-scattering GGX. Perceptual roughness."""
+    # Columns go by the root of the cosine, because all of the change is near grazing.
     y, x = 8.0 * min(1.0, max(0.0, roughness)), 8.0 * np.sqrt(min(1.0, max(0.0, n_dot_v)))
     j, i = min(7, int(y)), min(7, int(x))
     v, u = y - j, x - i
@@ -98,7 +117,7 @@ def directional_albedo(n_dot_v, roughness):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def specular_albedo(f0, roughness, n_dot_v):  # type: ignore[no-untyped-def]
+def specular_albedo(f0: Vec, roughness: float, n_dot_v: float) -> Vec:
     """Share of a uniform light that the lobe sends back, per channel. Its grazing value fades with an F0 below 2 %,
     so that a surface without any reflectance has no rim (Lagarde and de Rousiers 2014, section 3.1.2)."""
     a, b = directional_albedo(n_dot_v, roughness)

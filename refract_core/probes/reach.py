@@ -41,7 +41,7 @@ def reach_of(low: NDArray[np.float64], high: NDArray[np.float64]) -> Reach:
 
 
 @inlined
-def piece_of(cuts, axis, x):  # type: ignore[no-untyped-def]
+def piece_of(cuts: NDArray[np.float64], axis: int, x: float) -> int:
     """Number of the piece of an axis that holds `x`: how many cuts are not above it."""
     low, high = 0, cuts.shape[1]
     while low < high:
@@ -54,11 +54,12 @@ def piece_of(cuts, axis, x):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def next_of(sets, i, j, l, k):  # type: ignore[no-untyped-def] # noqa: E741
-    """Least probe number from `k` on that is in the sets of pieces i, j and l of the three axes; -1 for none."""
+def next_of(sets: NDArray[np.int64], i: int, j: int, m: int, k: int) -> int:
+    """Least probe number from `k` on that is in the sets of pieces i, j and m of the three axes; -1 for none."""
+    # Words keep 32 of their 64 bits, so that no bit is ever a sign and shifting right brings in zeros alone.
     word, bit = k // WORD, k % WORD
     while word < sets.shape[2]:
-        bits = (sets[0, i, word] & sets[1, j, word] & sets[2, l, word]) >> bit
+        bits = (sets[0, i, word] & sets[1, j, word] & sets[2, m, word]) >> bit
         if bits != 0:
             while bits & 1 == 0:
                 bits >>= 1
