@@ -22,9 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels.compile import inlined, kernel
-from ..kernels.lanes import LANES
-from ..kernels.vec import add, along, cross, dot, frame, normalize, row, scale, sub
+from ..kernels.lanes import LANES, Scalars, by_address, scratch
+from ..kernels.vec import Vec, add, along, cross, dot, frame, normalize, row, scale, sub
 from ..world.embree import (
+    DIR_X,
+    DIR_Y,
+    DIR_Z,
     EVERYTHING,
     GEOM,
     NG_X,
@@ -70,6 +73,25 @@ class Places(NamedTuple):
     """shape (N, 2): barycentric weights of the triangle's second and third corner"""
     normals: F64
     """shape (N, 3): unit, outward"""
+
+
+class Body(NamedTuple):
+    """One object by itself, moved to the origin and scaled to half a diagonal of 1; for the length of a `measure`."""
+
+    handle: int
+    """RTCScene"""
+    points: NDArray[np.float32]
+    """shape (V, 3), what Embree was given"""
+    triangles: U32
+    """shape (T, 3)"""
+
+
+class Casting(NamedTuple):
+    """What one thread needs to cast eight rays. Nothing in it outlives them."""
+
+    packet: Packet
+    lead: Scalars
+    """how far along the ray from its place it starts, > 0; below 0 once the lane has its answer"""
 
 
 def views(model_is_box: bool, ior: float, method: str) -> F64:
@@ -155,13 +177,14 @@ def measure(
     near = ((points - (low + high) / 2.0) / size).astype(np.float32)  # float32 is finest about the origin
     triangles = np.ascontiguousarray(triangles, np.uint32)
     bvh = Bvh(near, [Part(int(REFRACTIVE), triangles)])
+    body, where = by_address(Body(bvh.handle, near, triangles)), by_address(places)
     sums = np.zeros((len(places.triangle), 2))
     step = max(_CHUNK // len(rays), 1)
     pieces = [(start, min(start + step, len(sums))) for start in range(0, len(sums), step)]
 
     def work(piece: tuple[int, int]) -> None:
         go_on()
-        _measure(Packet.fresh(), bvh.handle, near, triangles, *places, rays, _ATTEMPTS, sums, *piece)
+        _measure(scratch(Casting), body, where, rays, sums, *piece)
 
     threads = min(jobs or os.cpu_count() or 1, len(pieces))
     if threads > 1:
@@ -203,55 +226,68 @@ def mended(values: F64, picks: Index) -> F64:
 
 
 @inlined
-def _place(points, triangles, triangle, second, third, pull):  # type: ignore[no-untyped-def]
-    """Point on a triangle, pulled a part of the way towards its middle, and the triangle's unit normal."""
-    a = row(points, triangles[triangle, 0])
-    b = row(points, triangles[triangle, 1])
-    c = row(points, triangles[triangle, 2])
+def _place(body: Body, places: Places, i: int, pull: float) -> tuple[Vec, Vec]:
+    """Place `i`, pulled a part of the way towards its triangle's middle, and the triangle's unit normal."""
+    t = places.triangle[i]
+    a = row(body.points, body.triangles[t, 0])
+    b = row(body.points, body.triangles[t, 1])
+    c = row(body.points, body.triangles[t, 2])
     ab, ac = sub(b, a), sub(c, a)
+    second, third = places.weights[i, 0], places.weights[i, 1]
     second += pull * (1.0 / 3.0 - second)
     third += pull * (1.0 / 3.0 - third)
     return along(along(a, ab, second), ac, third), normalize(cross(ab, ac))
 
 
 @inlined
-def _turned(view, axis):  # type: ignore[no-untyped-def]
+def _turned(view: Vec, axis: Vec) -> Vec:
     """A view's direction in the world, `axis` being its third one."""
     t, b = frame(axis)
     return add(add(scale(t, view[0]), scale(b, view[1])), scale(axis, view[2]))
 
 
+@inlined
+def _cast(casting: Casting, lane: int, body: Body, places: Places, i: int, view: Vec, pull: float) -> None:
+    """Put the ray of a view into place `i` into a lane."""
+    p, ng = _place(body, places, i, pull)
+    n = row(places.normals, i)
+    if dot(ng, ng) == 0.0:  # a sliver that float32 made a line
+        ng = n
+    d = _turned(view, scale(n, -1.0))
+    if dot(d, ng) > -_GRAZING:  # a steep shading normal must not send the ray out
+        d = _turned(view, scale(ng, -1.0))
+    # The ray starts under the surface by the same depth whatever its slant, and its length is counted from the place.
+    casting.lead[lane] = -_START / dot(d, ng)
+    set_ray(casting.packet, lane, along(p, d, casting.lead[lane]), d, 0.0, math.inf, EVERYTHING)
+
+
 @kernel
-def _measure(packet, handle, points, triangles, triangle, weights, normals, rays, attempts, sums, first, last):  # type: ignore[no-untyped-def]
-    """Cast the rays of the places `first` .. `last`; `sums` (N, 2) takes length times model path, and its square."""
+def _measure(casting: Casting, body: Body, places: Places, rays: F64, sums: F64, first: int, last: int) -> None:
+    """Cast the rays of the places `first` .. `last`; `sums` (N, 2) takes length times model path, and its square.
+
+    Lanes are rays, not places: eight of them in a row, whichever place each belongs to.
+    """
+    packet, lead = casting.packet, casting.lead
     count = len(rays)
-    lead = np.zeros(LANES)  # < 0: this lane has its answer
     for start in range(first * count, last * count, LANES):
         for lane in range(LANES):
             lead[lane] = 0.0
-        for attempt in range(len(attempts)):
+        for attempt in range(len(_ATTEMPTS)):
             clear(packet)
             for lane in range(LANES):
                 ray = start + lane
-                if ray >= last * count or lead[lane] < 0.0:
-                    continue
-                i, view = ray // count, row(rays, ray % count)
-                p, ng = _place(points, triangles, triangle[i], weights[i, 0], weights[i, 1], attempts[attempt])
-                if dot(ng, ng) == 0.0:  # a sliver that float32 made a line
-                    ng = row(normals, i)
-                d = _turned(view, scale(row(normals, i), -1.0))
-                if dot(d, ng) > -_GRAZING:  # a steep shading normal must not send the ray out
-                    d = _turned(view, scale(ng, -1.0))
-                lead[lane] = -_START / dot(d, ng)
-                set_ray(packet, lane, along(p, d, lead[lane]), d, 0.0, math.inf, EVERYTHING)
-            intersect(packet, handle, SCATTERED)
+                if ray < last * count and lead[lane] >= 0.0:
+                    _cast(casting, lane, body, places, ray // count, row(rays, ray % count), _ATTEMPTS[attempt])
+            intersect(packet, body.handle, SCATTERED)
             again = False
             for lane in range(LANES):
                 if packet.valid[lane] == 0:
                     continue
-                if _leaves(packet, lane) or (attempt == len(attempts) - 1 and packet.words[GEOM, lane] >= 0):
+                # At the last attempt a surface met from outside will do: it is there, and nothing better is.
+                if _leaves(packet, lane) or (attempt == len(_ATTEMPTS) - 1 and packet.words[GEOM, lane] >= 0):
                     ray = start + lane
                     path = rays[ray % count, 3]
+                    # Least squares of thickness * path = length, over the rays of a place.
                     sums[ray // count, 0] += (packet.rays[T_FAR, lane] + lead[lane]) * path
                     sums[ray // count, 1] += path * path
                     lead[lane] = -1.0
@@ -262,10 +298,10 @@ def _measure(packet, handle, points, triangles, triangle, weights, normals, rays
 
 
 @inlined
-def _leaves(packet, lane):  # type: ignore[no-untyped-def]
+def _leaves(packet: Packet, lane: int) -> bool:
     """The lane's ray met a surface from within. A hit from outside means that it started on the wrong side."""
     if packet.words[GEOM, lane] < 0:
         return False
     rays = packet.rays
-    d = (float(rays[4, lane]), float(rays[5, lane]), float(rays[6, lane]))
+    d = (float(rays[DIR_X, lane]), float(rays[DIR_Y, lane]), float(rays[DIR_Z, lane]))
     return dot(d, (float(rays[NG_X, lane]), float(rays[NG_Y, lane]), float(rays[NG_Z, lane]))) > 0.0

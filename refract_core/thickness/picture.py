@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 
 from ..kernels.compile import inlined, kernel
+from ..kernels.lanes import by_address
 from ..scene import F32
 from .measure import F64, Index, Places
 
@@ -19,6 +21,17 @@ OVERLAP = 0.03
 _GUTTER = 4
 _PIECE = 1 << 21  # texels looked at together
 _INSIDE = 1.0e-4
+
+
+class Covered(NamedTuple):
+    """Texels and the places they stand for, in the order in which triangles cover them."""
+
+    texel: Index
+    """shape (N,): row by row from the top"""
+    triangle: Index
+    """shape (N,)"""
+    weights: F64
+    """shape (N, 2): barycentric weights of the triangle's second and third corner"""
 
 
 def is_tiled(uv: F64) -> bool:
@@ -40,8 +53,7 @@ def texels(uv: F64, normals: F64, size: int) -> Iterator[tuple[Index, Places]]:
     at = uv * (size, -size) + (-0.5, size - 0.5)  # x to the right, y down, whole numbers in the middle of texels
     tiled = is_tiled(uv)
     counts = np.zeros(len(at), np.int64)
-    nothing = np.zeros(0, np.int64)
-    _cover(at, 0, len(at), size, tiled, counts, False, nothing, nothing, np.zeros((0, 2)))
+    _count(at, size, tiled, counts)
     ends = np.cumsum(counts)
     first = 0
     while first < len(at):
@@ -49,8 +61,9 @@ def texels(uv: F64, normals: F64, size: int) -> Iterator[tuple[Index, Places]]:
         last = max(int(np.searchsorted(ends, before + _PIECE, side="right")), first + 1)
         count = int(ends[last - 1]) - before
         if count:
-            texel, triangle, weights = np.zeros(count, np.int64), np.zeros(count, np.int64), np.zeros((count, 2))
-            _cover(at, first, last, size, tiled, counts, True, texel, triangle, weights)
+            found = Covered(np.zeros(count, np.int64), np.zeros(count, np.int64), np.zeros((count, 2)))
+            _list(at, first, last, size, tiled, by_address(found))
+            texel, triangle, weights = found
             third = weights[:, 1:]
             corners = normals[triangle]
             mixed = corners[:, 0] * (1.0 - weights[:, :1] - third) + corners[:, 1] * weights[:, :1]
@@ -112,8 +125,12 @@ def _filled(values: F64, weight: F64) -> F64:
 
 
 @inlined
-def _edge(at, triangle, a, b, x, y):  # type: ignore[no-untyped-def]
-    """Twice the area between an edge and a point, computed from the same end whichever way the edge is asked for."""
+def _edge(at: F64, triangle: int, a: int, b: int, x: float, y: float) -> float:
+    """Twice the area between an edge and a point, computed from the same end whichever way the edge is asked for.
+
+    Two triangles that share an edge so get the same number with opposite signs, to the last bit: no texel on their
+    seam is lost or counted twice by rounding.
+    """
     ax, ay = at[triangle, a, 0], at[triangle, a, 1]
     bx, by = at[triangle, b, 0], at[triangle, b, 1]
     if ax < bx or (ax == bx and ay < by):
@@ -122,7 +139,7 @@ def _edge(at, triangle, a, b, x, y):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _owns(value, at, triangle, a, b, sign):  # type: ignore[no-untyped-def]
+def _owns(value: float, at: F64, triangle: int, a: int, b: int, sign: float) -> bool:
     """The point is on the inner side of an edge, or on the edge and it is a left or a top one."""
     if value != 0.0:
         return value > 0.0
@@ -131,34 +148,68 @@ def _owns(value, at, triangle, a, b, sign):  # type: ignore[no-untyped-def]
     return dy < 0.0 or (dy == 0.0 and dx > 0.0)
 
 
+@inlined
+def _sense(at: F64, t: int) -> float:
+    """1 or -1 by the way a triangle turns in the picture (uv may be mirrored); 0 where it has no area."""
+    area = _edge(at, t, 0, 1, at[t, 2, 0], at[t, 2, 1])
+    if area == 0.0:
+        return 0.0
+    return 1.0 if area > 0.0 else -1.0
+
+
+@inlined
+def _texels_around(at: F64, t: int, size: int, tiled: bool) -> tuple[int, int, int, int]:
+    """First and last column, first and last row of the texels that a triangle may cover."""
+    low_x = int(np.ceil(min(at[t, 0, 0], at[t, 1, 0], at[t, 2, 0])))
+    high_x = int(np.floor(max(at[t, 0, 0], at[t, 1, 0], at[t, 2, 0])))
+    low_y = int(np.ceil(min(at[t, 0, 1], at[t, 1, 1], at[t, 2, 1])))
+    high_y = int(np.floor(max(at[t, 0, 1], at[t, 1, 1], at[t, 2, 1])))
+    if tiled:
+        return low_x, high_x, low_y, high_y
+    return max(low_x, 0), min(high_x, size - 1), max(low_y, 0), min(high_y, size - 1)
+
+
+@inlined
+def _areas(at: F64, t: int, sign: float, x: int, y: int) -> tuple[bool, float, float, float]:
+    """Whether a triangle covers the middle of a texel, and its barycentric weights there, not yet divided by their
+    sum."""
+    w0 = sign * _edge(at, t, 1, 2, x, y)
+    w1 = sign * _edge(at, t, 2, 0, x, y)
+    w2 = sign * _edge(at, t, 0, 1, x, y)
+    covers = _owns(w0, at, t, 1, 2, sign) and _owns(w1, at, t, 2, 0, sign) and _owns(w2, at, t, 0, 1, sign)
+    return covers, w0, w1, w2
+
+
 @kernel
-def _cover(at, first, last, size, tiled, counts, write, texel, triangle, weights):  # type: ignore[no-untyped-def]
-    """Count the texels of triangles `first` .. `last`, or write them down."""
-    filled = 0
-    for t in range(first, last):
-        area = _edge(at, t, 0, 1, at[t, 2, 0], at[t, 2, 1])
-        if area == 0.0:
+def _count(at: F64, size: int, tiled: bool, counts: Index) -> None:
+    """How many texels each triangle covers. `at`: shape (T, 3, 2), whole numbers in the middle of texels."""
+    for t in range(len(at)):
+        sign = _sense(at, t)
+        if sign == 0.0:
             continue
-        sign = 1.0 if area > 0.0 else -1.0
-        low_x = int(np.ceil(min(at[t, 0, 0], at[t, 1, 0], at[t, 2, 0])))
-        high_x = int(np.floor(max(at[t, 0, 0], at[t, 1, 0], at[t, 2, 0])))
-        low_y = int(np.ceil(min(at[t, 0, 1], at[t, 1, 1], at[t, 2, 1])))
-        high_y = int(np.floor(max(at[t, 0, 1], at[t, 1, 1], at[t, 2, 1])))
-        if not tiled:
-            low_x, low_y = max(low_x, 0), max(low_y, 0)
-            high_x, high_y = min(high_x, size - 1), min(high_y, size - 1)
+        low_x, high_x, low_y, high_y = _texels_around(at, t, size, tiled)
         for y in range(low_y, high_y + 1):
             for x in range(low_x, high_x + 1):
-                w0 = sign * _edge(at, t, 1, 2, x, y)
-                w1 = sign * _edge(at, t, 2, 0, x, y)
-                w2 = sign * _edge(at, t, 0, 1, x, y)
-                if not (_owns(w0, at, t, 1, 2, sign) and _owns(w1, at, t, 2, 0, sign) and _owns(w2, at, t, 0, 1, sign)):
-                    continue
-                if write:
-                    texel[filled] = (y % size) * size + x % size
-                    triangle[filled] = t
-                    weights[filled, 0] = w1 / (w0 + w1 + w2)
-                    weights[filled, 1] = w2 / (w0 + w1 + w2)
-                    filled += 1
-                else:
+                if _areas(at, t, sign, x, y)[0]:
                     counts[t] += 1
+
+
+@kernel
+def _list(at: F64, first: int, last: int, size: int, tiled: bool, found: Covered) -> None:
+    """Write down the texels of triangles `first` .. `last`; `found` has room for as many as `_count` says."""
+    filled = 0
+    for t in range(first, last):
+        sign = _sense(at, t)
+        if sign == 0.0:
+            continue
+        low_x, high_x, low_y, high_y = _texels_around(at, t, size, tiled)
+        for y in range(low_y, high_y + 1):
+            for x in range(low_x, high_x + 1):
+                covers, w0, w1, w2 = _areas(at, t, sign, x, y)
+                if not covers:
+                    continue
+                found.texel[filled] = (y % size) * size + x % size
+                found.triangle[filled] = t
+                found.weights[filled, 0] = w1 / (w0 + w1 + w2)
+                found.weights[filled, 1] = w2 / (w0 + w1 + w2)
+                filled += 1
