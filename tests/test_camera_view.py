@@ -11,7 +11,7 @@ from scenes import camera, view_rays
 
 from refract_core.errors import UsageError
 from refract_core.kernels.compile import kernel
-from refract_core.kernels.pointer import Pointer
+from refract_core.kernels.lanes import by_address
 from refract_core.kernels.sampling import pixel_offset
 from refract_core.scene import Camera
 from refract_core.view.camera import View, image_size, pixel_point, pixel_ray, project, view_of
@@ -24,7 +24,7 @@ CAMERAS = pytest.mark.parametrize("of", [PERSPECTIVE, ORTHOGRAPHIC], ids=["persp
 
 
 @kernel
-def _rays(view, pixels, out):  # type: ignore[no-untyped-def]
+def _rays(view: View, pixels: F64, out: F64) -> None:
     for i in range(pixels.shape[0]):
         o, d, cosine = pixel_ray(view, pixels[i, 0], pixels[i, 1])
         out[i, 0], out[i, 1], out[i, 2] = o[0], o[1], o[2]
@@ -32,7 +32,7 @@ def _rays(view, pixels, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _around(view, pixels, out):  # type: ignore[no-untyped-def]
+def _around(view: View, pixels: F64, out: F64) -> None:
     for i in range(pixels.shape[0]):
         p = pixel_point(view, pixels[i, 0], pixels[i, 1], pixels[i, 2])
         out[i, 0], out[i, 1], out[i, 2] = project(view, p)
@@ -40,7 +40,7 @@ def _around(view, pixels, out):  # type: ignore[no-untyped-def]
 
 def rays(view: View, pixels: F64) -> tuple[F64, F64, F64]:
     out = np.empty((len(pixels), 7))
-    _rays(Pointer(view), pixels, out)
+    _rays(by_address(view), pixels, out)
     return out[:, :3], out[:, 3:6], out[:, 6]
 
 
@@ -54,7 +54,7 @@ def test_a_pixel_projects_to_itself(of: Camera) -> None:
     rng = np.random.default_rng(1)
     pixels = np.stack([rng.uniform(0, 120, 200), rng.uniform(0, 50, 200), rng.uniform(0.1, 30, 200)], 1)
     out = np.empty_like(pixels)
-    _around(Pointer(view_of(of, 120, 50)), pixels, out)
+    _around(by_address(view_of(of, 120, 50)), pixels, out)
     np.testing.assert_allclose(out, pixels, rtol=1e-9, atol=1e-9)
 
 

@@ -12,11 +12,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from refract_core.kernels.compile import kernel
+from refract_core.kernels.lanes import by_address
 from refract_core.optics.interface import probe_roughness_hdrp
 from refract_core.probes.faces import (
     CUBE,
     TEXEL,
+    Level,
     Levels,
+    Picture,
     averages,
     direction_face,
     face_direction,
@@ -25,6 +28,7 @@ from refract_core.probes.faces import (
     halve,
     layout,
     level_at,
+    level_of,
     lobe_samples,
     side_of,
     view_of_level,
@@ -36,16 +40,17 @@ UNTIMED = settings(deadline=None)  # the first example compiles
 
 
 @kernel
-def _at(pool, first, side, last, directions, lod, out):  # type: ignore[no-untyped-def]
+def _at(picture: Picture, directions: F64, lod: float, out: F64) -> None:
     for i in range(directions.shape[0]):
         face, x, y = direction_face((directions[i, 0], directions[i, 1], directions[i, 2]))
-        out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = level_at(pool, first, side, last, face, x, y, lod)
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = level_at(picture, face, x, y, lod)
 
 
 def at(pool: F32, levels: Levels, directions: F64, lod: float) -> F64:
     """Red of a picture in some directions."""
     out = np.empty((len(directions), TEXEL))
-    _at(pool, levels.first, levels.side, len(levels.side) - 1, np.ascontiguousarray(directions), lod, out)
+    looked_at = Picture(pool, levels.first, levels.side, len(levels.side) - 1)
+    _at(by_address(looked_at), np.ascontiguousarray(directions), lod, out)
     return out[:, 0]
 
 
@@ -62,14 +67,13 @@ def picture(values: NDArray[np.floating]) -> tuple[F32, Levels]:
     levels, size = layout(n, 7, CUBE)
     pool = np.zeros(size, np.float32)
     view_of_level(pool, levels, 0, CUBE)[:, 1:-1, 1:-1, 0] = values
-    fill_cube_border(pool, 0, n)
-    source, halves = averages(pool, 0, n)
+    fill_cube_border(by_address(Level(pool, 0, n)))
+    source = by_address(averages(Level(pool, 0, n)))
     for level in range(1, 7):
-        first, side = int(levels.first[level]), int(levels.side[level])
+        target = by_address(level_of(pool, levels, level))
         for face in range(CUBE):
-            lobe = lobe_samples(level, n)
-            filter_face(source, halves.first, halves.side, pool, first, side, face, lobe)
-        fill_cube_border(pool, first, side)
+            filter_face(source, target, face, lobe_samples(level, n))
+        fill_cube_border(target)
     return pool, levels
 
 
@@ -127,7 +131,7 @@ def test_no_seam_on_edges_and_corners_whatever_the_texels_are(resolution: int) -
     levels, size = layout(resolution, 1, CUBE)
     pool = np.zeros(size, np.float32)
     view_of_level(pool, levels, 0, CUBE)[:, 1:-1, 1:-1, 0] = rng.random((CUBE, resolution, resolution))
-    fill_cube_border(pool, 0, resolution)
+    fill_cube_border(by_address(Level(pool, 0, resolution)))
     along = rng.uniform(-1, 1, 400)
     along[:40] = np.where(along[:40] > 0, 1, -1)  # corners
     for axes in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -150,7 +154,7 @@ def test_halving_keeps_a_constant_and_a_symmetric_mean(m: int) -> None:
     source[:, 1:-1, 1:-1, 0] = 0.7
     source[:, 1:-1, 1:-1, 1] = ramp[None, :, None] + 3 * ramp[None, None, :]
     target = np.zeros((CUBE, n + 2, n + 2, TEXEL), np.float32)
-    halve(source.ravel(), 0, m, target.reshape(-1), 0, n, CUBE)
+    halve(by_address(Level(source.reshape(-1), 0, m)), by_address(Level(target.reshape(-1), 0, n)), CUBE)
     inner = target[:, 1:-1, 1:-1]
     np.testing.assert_allclose(inner[..., 0], 0.7, rtol=1e-6)
     np.testing.assert_allclose(inner[..., 1].mean((1, 2)), 0.0, atol=1e-6)

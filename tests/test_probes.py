@@ -27,7 +27,7 @@ from scenes import (
 )
 
 from refract_core.kernels.compile import kernel
-from refract_core.probes.lookup import cube_at
+from refract_core.probes.lookup import ProbeTable, cube_at
 from refract_core.probes.plan import in_order
 from refract_core.rendering.session import Session, prepare
 from refract_core.rendering.work import Work
@@ -59,7 +59,7 @@ def prepared(what: Scene, samples: int = 1) -> Session:
 
 
 @kernel
-def _look(table, k, directions, lod, out):  # type: ignore[no-untyped-def]
+def _look(table: ProbeTable, k: int, directions: F64, lod: float, out: F64) -> None:
     for i in range(directions.shape[0]):
         d = (directions[i, 0], directions[i, 1], directions[i, 2])
         out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = cube_at(table, k, d, lod)
@@ -116,12 +116,12 @@ def test_levels_of_a_constant_room_are_that_constant(lod: float) -> None:
     rough = glass(Model.TRACED, ROUGHNESS=0.5)
     what = scene(walls, [*materials, rough], [Sphere("/ball", CENTRE, 0.5, 1)], probes=(probe(),))
     session = prepared(what)
-    assert session.probes.record.last[0] == 6
+    assert session.table.last[0] == 6
     np.testing.assert_allclose(look(session, directions(300), lod)[:, :4], [[0.6, 0.6, 0.6, 1.0]] * 300, rtol=1e-5)
 
 
 def test_smooth_glass_costs_no_levels() -> None:
-    assert prepared(with_probe(probe())).probes.record.last[0] == 0
+    assert prepared(with_probe(probe())).table.last[0] == 0
 
 
 def test_a_background_stands_in_for_the_sky() -> None:

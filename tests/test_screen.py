@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scenes import camera, view_rays
 
 from refract_core.kernels.compile import kernel
-from refract_core.kernels.pointer import Pointer
+from refract_core.kernels.lanes import by_address
 from refract_core.scene import Camera
 from refract_core.view.camera import view_of
 from refract_core.view.pyramid import (
@@ -21,6 +21,7 @@ from refract_core.view.pyramid import (
     color_levels,
     depth_levels,
     fill_depth_levels,
+    new_blur_scratch,
     new_screen_buffers,
 )
 from refract_core.view.screen import march
@@ -33,12 +34,12 @@ FLAT = camera((0, 0, 0), (0, 0, -1), fov=2.0, aspect=1.5, orthographic=True)
 
 
 @kernel
-def _march(screen, origins, directions, out):  # type: ignore[no-untyped-def]
+def _march(screen: Screen, origins: F64, directions: F64, out: F64) -> None:
     for i in range(origins.shape[0]):
         o = (origins[i, 0], origins[i, 1], origins[i, 2])
         d = (directions[i, 0], directions[i, 1], directions[i, 2])
-        found, px, py, s = march(screen, o, d)
-        out[i, 0], out[i, 1], out[i, 2], out[i, 3] = 1.0 if found else 0.0, px, py, s
+        hit = march(screen, o, d)
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3] = 1.0 if hit.found else 0.0, hit.x, hit.y, hit.distance
 
 
 def shoot(screen: Screen, origins: ArrayLike, directions: ArrayLike) -> F64:
@@ -47,7 +48,7 @@ def shoot(screen: Screen, origins: ArrayLike, directions: ArrayLike) -> F64:
     d = d / np.linalg.norm(d, axis=1, keepdims=True)
     o = np.broadcast_to(np.asarray(origins, np.float64), d.shape).copy()
     out = np.empty((len(d), 4))
-    _march(Pointer(screen), o, d, out)
+    _march(by_address(screen), o, d, out)
     return out
 
 
@@ -184,7 +185,7 @@ def test_blurring_keeps_a_constant_and_spreads_a_spot() -> None:
         else:
             color[:4096].reshape(64, 64, 3)[30:34, 30:34] = 1.0
         for k in range(1, 3):
-            blur_level(color, levels, k)
+            blur_level(color, levels, k, by_address(new_blur_scratch(levels)))
             first, w, h = levels[k]
             level = color[first : first + w * h]
             if value == "constant":
@@ -192,6 +193,22 @@ def test_blurring_keeps_a_constant_and_spreads_a_spot() -> None:
             else:
                 assert level.sum() / 3 == pytest.approx(16 / 4**k, rel=1e-3)
                 assert level.max() < 1.0
+
+
+def test_what_is_left_in_the_working_memory_of_a_blur_does_not_show() -> None:
+    """Levels of an odd size made in memory full of NaN, and again in what that left."""
+    levels = color_levels(37, 21, True)
+    color = np.zeros((int((levels[:, 1] * levels[:, 2]).sum()), 3), np.float32)
+    color[: 37 * 21] = np.random.default_rng(5).random((37 * 21, 3))
+    work = new_blur_scratch(levels)
+    work.half[:] = work.across[:] = np.nan
+    made = []
+    for _ in range(2):
+        for k in range(1, len(levels)):
+            blur_level(color, levels, k, by_address(work))
+        made.append(color.copy())
+    assert np.isfinite(made[0]).all()
+    np.testing.assert_array_equal(made[0], made[1])
 
 
 def test_color_levels_halve_and_floor_until_small() -> None:

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels.compile import inlined, kernel
-from ..kernels.vec import add, frame, normalize, scale
+from ..kernels.lanes import by_address
+from ..kernels.vec import Vec, add, frame, normalize, scale
 from ..optics.interface import probe_roughness_hdrp
 from ..scene import CUBE_LEVELS
 
@@ -32,6 +33,10 @@ _COARSER = 0.5
 """Levels by which averages are read coarser than a sample's share of the lobe, so that shares overlap and hide."""
 
 
+Texel = tuple[float, float, float, float, float]
+"""red, green, blue (premultiplied by coverage), coverage, distance [m]"""
+
+
 class Levels(NamedTuple):
     """Where the levels of one picture lie in a pool of floats."""
 
@@ -39,6 +44,35 @@ class Levels(NamedTuple):
     """shape (L,): offset of each level in the pool; -1 for none"""
     side: NDArray[np.int64]
     """shape (L,): texels on a side, without the border"""
+
+
+class Picture(NamedTuple):
+    """All levels of one picture, to be looked up. The pool, which other pictures share, outlives it."""
+
+    texels: NDArray[np.float32]
+    """flat pool"""
+    first: NDArray[np.int64]
+    """shape (L,): offset of each level in the pool"""
+    side: NDArray[np.int64]
+    """shape (L,): texels on a side of each, without the border"""
+    last: int
+    """highest level there is; arrays may be longer"""
+
+
+class Level(NamedTuple):
+    """One level of a picture, to be written. The pool outlives it."""
+
+    texels: NDArray[np.float32]
+    """flat pool"""
+    first: int
+    """offset of the level in the pool"""
+    side: int
+    """texels on a side, without the border"""
+
+
+def level_of(texels: NDArray[np.float32], levels: Levels, level: int) -> Level:
+    """One level of a picture whose levels lie in the pool `texels`."""
+    return Level(texels, int(levels.first[level]), int(levels.side[level]))
 
 
 def side_of(resolution: int, level: int) -> int:
@@ -67,7 +101,7 @@ def view_of_level(pool: NDArray[np.float32], levels: Levels, level: int, faces: 
 
 
 @inlined
-def face_direction(face, x, y):  # type: ignore[no-untyped-def]
+def face_direction(face: int, x: float, y: float) -> Vec:
     """Unnormalised direction of face coordinates x, y in [-1, 1] (x right, y down, seen from the centre)."""
     if face == 0:
         return (1.0, -y, -x)
@@ -83,8 +117,9 @@ def face_direction(face, x, y):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def direction_face(d):  # type: ignore[no-untyped-def]
+def direction_face(d: Vec) -> tuple[int, float, float]:
     """(face, x, y) that a direction meets: the inverse of `face_direction`."""
+    # The longest component names the face; the ray meets it where that component is 1.
     ax, ay, az = abs(d[0]), abs(d[1]), abs(d[2])
     if ax >= ay and ax >= az:
         return (0, -d[2] / ax, -d[1] / ax) if d[0] > 0.0 else (1, d[2] / ax, -d[1] / ax)
@@ -97,35 +132,45 @@ def direction_face(d):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def texel_at(pool, first, n, face, x, y):  # type: ignore[no-untyped-def]
-    """Bilinear texel (r, g, b, coverage, distance) at face coordinates in [-1, 1]."""
-    stride = n + 2
+def _texel_number(face: int, x: int, y: int, side: int) -> int:
+    """Number of a texel within its level; x and y count the border, so that the first inner texel is 1."""
+    stride = side + 2
+    return (face * stride + y) * stride + x
+
+
+@inlined
+def texel_at(picture: Picture, level: int, face: int, x: float, y: float) -> Texel:
+    """Bilinear texel at face coordinates in [-1, 1]."""
+    pool, n = picture.texels, picture.side[level]
+    # Texel centres lie at halves, and the border shifts them by one: pixel coordinate 0.5 is the face's very edge.
     px = (x + 1.0) * 0.5 * n + 0.5
     py = (y + 1.0) * 0.5 * n + 0.5
-    x0 = min(max(int(px), 0), stride - 2)
-    y0 = min(max(int(py), 0), stride - 2)
+    x0 = min(max(int(px), 0), n)
+    y0 = min(max(int(py), 0), n)
     fx, fy = min(max(px - x0, 0.0), 1.0), min(max(py - y0, 0.0), 1.0)
-    a = first + ((face * stride + y0) * stride + x0) * TEXEL
-    b = a + stride * TEXEL
+    # The four texels around: a and b above, c and d below.
+    a = picture.first[level] + _texel_number(face, x0, y0, n) * TEXEL
+    c = a + (n + 2) * TEXEL
+    b, d = a + TEXEL, c + TEXEL
     wa, wb, wc, wd = (1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy
     return (
-        wa * pool[a] + wb * pool[a + 5] + wc * pool[b] + wd * pool[b + 5],
-        wa * pool[a + 1] + wb * pool[a + 6] + wc * pool[b + 1] + wd * pool[b + 6],
-        wa * pool[a + 2] + wb * pool[a + 7] + wc * pool[b + 2] + wd * pool[b + 7],
-        wa * pool[a + 3] + wb * pool[a + 8] + wc * pool[b + 3] + wd * pool[b + 8],
-        wa * pool[a + 4] + wb * pool[a + 9] + wc * pool[b + 4] + wd * pool[b + 9],
+        wa * pool[a] + wb * pool[b] + wc * pool[c] + wd * pool[d],
+        wa * pool[a + 1] + wb * pool[b + 1] + wc * pool[c + 1] + wd * pool[d + 1],
+        wa * pool[a + 2] + wb * pool[b + 2] + wc * pool[c + 2] + wd * pool[d + 2],
+        wa * pool[a + 3] + wb * pool[b + 3] + wc * pool[c + 3] + wd * pool[d + 3],
+        wa * pool[a + 4] + wb * pool[b + 4] + wc * pool[c + 4] + wd * pool[d + 4],
     )
 
 
 @inlined
-def level_at(pool, first, side, last, face, x, y, lod):  # type: ignore[no-untyped-def]
-    """Trilinear texel; `first` and `side` are indexed by level, `last` is the highest level there is."""
-    lod = min(max(lod, 0.0), float(last))
+def level_at(picture: Picture, face: int, x: float, y: float, lod: float) -> Texel:
+    """Trilinear texel: bilinear in the two levels around `lod`, which is cut to those there are."""
+    lod = min(max(lod, 0.0), float(picture.last))
     low = int(lod)
-    r, g, b, a, s = texel_at(pool, first[low], side[low], face, x, y)
+    r, g, b, a, s = texel_at(picture, low, face, x, y)
     f = lod - low
-    if f > 0.0 and low < last:
-        r1, g1, b1, a1, s1 = texel_at(pool, first[low + 1], side[low + 1], face, x, y)
+    if f > 0.0 and low < picture.last:
+        r1, g1, b1, a1, s1 = texel_at(picture, low + 1, face, x, y)
         return r + (r1 - r) * f, g + (g1 - g) * f, b + (b1 - b) * f, a + (a1 - a) * f, s + (s1 - s) * f
     return r, g, b, a, s
 
@@ -133,9 +178,17 @@ def level_at(pool, first, side, last, face, x, y, lod):  # type: ignore[no-untyp
 # ------------------------------------------------------------------------------------------------ borders and averages
 
 
+@inlined
+def _copy_texel(level: Level, source: int, target: int) -> None:
+    """All floats of a texel, by texel numbers."""
+    for c in range(TEXEL):
+        level.texels[level.first + target * TEXEL + c] = level.texels[level.first + source * TEXEL + c]
+
+
 @kernel
-def fill_cube_border(pool, first, n):  # type: ignore[no-untyped-def]
+def fill_cube_border(level: Level) -> None:
     """Border texels of one level of a cube, from the inner texels of the neighbouring faces."""
+    n = level.side
     stride = n + 2
     for face in range(CUBE):
         for y in range(stride):
@@ -143,54 +196,52 @@ def fill_cube_border(pool, first, n):  # type: ignore[no-untyped-def]
                 across, down = x == 0 or x == stride - 1, y == 0 or y == stride - 1
                 if across == down:  # inside, or a corner
                     continue
+                # The centre of a border texel lies beyond the face's edge: in its direction another face is met.
                 d = face_direction(face, (x - 0.5) / n * 2.0 - 1.0, (y - 0.5) / n * 2.0 - 1.0)
                 other, u, v = direction_face(d)
                 ix = min(max(int((u + 1.0) * 0.5 * n), 0), n - 1) + 1
                 iy = min(max(int((v + 1.0) * 0.5 * n), 0), n - 1) + 1
-                for c in range(TEXEL):
-                    pool[first + ((face * stride + y) * stride + x) * TEXEL + c] = pool[
-                        first + ((other * stride + iy) * stride + ix) * TEXEL + c
-                    ]
+                _copy_texel(level, _texel_number(other, ix, iy, n), _texel_number(face, x, y, n))
+        # Three faces meet at a corner and none has a texel there: the mean of the three that come nearest.
         for corner in range(4):
             x, y = (stride - 1) * (corner % 2), (stride - 1) * (corner // 2)
             ix, iy = min(max(x, 1), n), min(max(y, 1), n)
             for c in range(TEXEL):
-                inner = pool[first + ((face * stride + iy) * stride + ix) * TEXEL + c]
-                beside = pool[first + ((face * stride + iy) * stride + x) * TEXEL + c]
-                above = pool[first + ((face * stride + y) * stride + ix) * TEXEL + c]
-                pool[first + ((face * stride + y) * stride + x) * TEXEL + c] = (inner + beside + above) / 3.0
+                inner = level.texels[level.first + _texel_number(face, ix, iy, n) * TEXEL + c]
+                beside = level.texels[level.first + _texel_number(face, x, iy, n) * TEXEL + c]
+                above = level.texels[level.first + _texel_number(face, ix, y, n) * TEXEL + c]
+                level.texels[level.first + _texel_number(face, x, y, n) * TEXEL + c] = (inner + beside + above) / 3.0
 
 
 @kernel
-def fill_window_border(pool, first, n):  # type: ignore[no-untyped-def]
+def fill_window_border(level: Level) -> None:
     """Border texels of one level of a window: the nearest inner texel."""
-    stride = n + 2
+    n = level.side
     for face in range(WINDOW):
-        for y in range(stride):
-            for x in range(stride):
+        for y in range(n + 2):
+            for x in range(n + 2):
                 ix, iy = min(max(x, 1), n), min(max(y, 1), n)
-                for c in range(TEXEL):
-                    pool[first + ((face * stride + y) * stride + x) * TEXEL + c] = pool[
-                        first + ((face * stride + iy) * stride + ix) * TEXEL + c
-                    ]
+                _copy_texel(level, _texel_number(face, ix, iy, n), _texel_number(face, x, y, n))
 
 
 @kernel
-def halve(source, from_first, m, target, to_first, n, faces):  # type: ignore[no-untyped-def]
+def halve(source: Level, target: Level, faces: int) -> None:
     """Average faces of m x m texels into faces of n x n, n = m // 2; where m is odd the middle counts on both sides."""
-    wide, stride = m + 2, n + 2
+    m, n = source.side, target.side
     for face in range(faces):
         for y in range(n):
             ya, yb = y * m // n, ((y + 1) * m + n - 1) // n
             for x in range(n):
                 xa, xb = x * m // n, ((x + 1) * m + n - 1) // n
-                i = to_first + ((face * stride + y + 1) * stride + x + 1) * TEXEL
+                i = target.first + _texel_number(face, x + 1, y + 1, n) * TEXEL
                 for c in range(TEXEL):
                     total = 0.0
                     for sy in range(ya, yb):
                         for sx in range(xa, xb):
-                            total += source[from_first + ((face * wide + sy + 1) * wide + sx + 1) * TEXEL + c]
-                    target[i + c] = total / ((yb - ya) * (xb - xa))
+                            total += source.texels[
+                                source.first + _texel_number(face, sx + 1, sy + 1, m) * TEXEL + c
+                            ]
+                    target.texels[i + c] = total / ((yb - ya) * (xb - xa))
 
 
 # ------------------------------------------------------------------------------------------------ prefilter
@@ -226,45 +277,45 @@ def lobe_samples(level: int, resolution: int) -> NDArray[np.float64]:
 
 
 @kernel
-def filter_face(source, first, side, target, to_first, n, face, samples):  # type: ignore[no-untyped-def]
-    """Blur averages (`source`, `first`, `side`: every level of them) into one face of n x n texels of `target`."""
-    stride = n + 2
-    last = side.shape[0] - 1
+def filter_face(source: Picture, target: Level, face: int, lobe: NDArray[np.float64]) -> None:
+    """Blur a picture's averages, `source`, into one face of a level, by the samples of a lobe (`lobe_samples`)."""
+    n = target.side
     for y in range(n):
         for x in range(n):
+            # A level cannot know the view, so normal, view and reflection are taken for one (Karis 2013).
             axis = normalize(face_direction(face, (x + 0.5) / n * 2.0 - 1.0, (y + 0.5) / n * 2.0 - 1.0))
             across, up = frame(axis)
             r = g = b = a = s = 0.0
-            for k in range(samples.shape[0]):
-                d = add(add(scale(across, samples[k, 0]), scale(up, samples[k, 1])), scale(axis, samples[k, 2]))
+            for k in range(lobe.shape[0]):
+                d = add(add(scale(across, lobe[k, 0]), scale(up, lobe[k, 1])), scale(axis, lobe[k, 2]))
                 other, u, v = direction_face(d)
-                r1, g1, b1, a1, s1 = level_at(source, first, side, last, other, u, v, samples[k, 4])
-                w = samples[k, 3]
+                r1, g1, b1, a1, s1 = level_at(source, other, u, v, lobe[k, 4])
+                w = lobe[k, 3]
                 r += w * r1
                 g += w * g1
                 b += w * b1
                 a += w * a1
                 s += w * s1
-            i = to_first + ((face * stride + y + 1) * stride + x + 1) * TEXEL
-            target[i] = r
-            target[i + 1] = g
-            target[i + 2] = b
-            target[i + 3] = a
-            target[i + 4] = s
+            i = target.first + _texel_number(face, x + 1, y + 1, n) * TEXEL
+            target.texels[i] = r
+            target.texels[i + 1] = g
+            target.texels[i + 2] = b
+            target.texels[i + 3] = a
+            target.texels[i + 4] = s
 
 
-def averages(pool: NDArray[np.float32], first: int, resolution: int) -> tuple[NDArray[np.float32], Levels]:
+def averages(level: Level) -> Picture:
     """Every halving of a cube's level 0, down to single texels, in a pool of their own."""
-    count = int(math.log2(resolution)) + 1
-    levels, size = layout(resolution, count, CUBE)
+    count = int(math.log2(level.side)) + 1
+    levels, size = layout(level.side, count, CUBE)
     own = np.empty(size, np.float32)
-    n = resolution + 2
-    own[: CUBE * n * n * TEXEL] = pool[first : first + CUBE * n * n * TEXEL]
-    for level in range(1, count):
-        m, n = int(levels.side[level - 1]), int(levels.side[level])
-        halve(own, int(levels.first[level - 1]), m, own, int(levels.first[level]), n, CUBE)
-        fill_cube_border(own, int(levels.first[level]), n)
-    return own, levels
+    floats = CUBE * (level.side + 2) ** 2 * TEXEL
+    own[:floats] = level.texels[level.first : level.first + floats]
+    for m in range(1, count):
+        coarser = by_address(level_of(own, levels, m))
+        halve(by_address(level_of(own, levels, m - 1)), coarser, CUBE)
+        fill_cube_border(coarser)
+    return Picture(own, levels.first, levels.side, count - 1)
 
 
 def level_count(resolution: int, faces: int, rough: bool) -> int:

@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels.compile import inlined
-from ..kernels.vec import along, length, row, scale, sub, transform_direction, transform_point
+from ..kernels.vec import Vec, along, length, row, scale, sub, transform_direction, transform_point
 from ..optics.interface import probe_lod_hdrp
+from ..optics.lobes import Cone
 from ..scene import Camera, Probe
-from ..world.environment import prefiltered
-from .faces import CUBE, WINDOW, direction_face, layout, level_at, level_count
+from ..world.environment import EnvironmentTable, prefiltered
+from .faces import CUBE, WINDOW, Picture, Texel, direction_face, layout, level_at, level_count
 from .planar import window_of, window_weight
 from .reach import Reach, reach_of
 from .volumes import INFINITE_DISTANCE, distance_fade, influence_box, influence_sphere, ray_box, ray_sphere
@@ -67,6 +68,19 @@ class ProbeTable(NamedTuple):
     multiplier: NDArray[np.float64]
     sharp_near: NDArray[np.uint8]
     """shape (K,): HDRP's distance-based roughness"""
+
+
+class ProbeLight(NamedTuple):
+    """What a probe shows to one ray. It lives as long as that ray is asked for."""
+
+    color: Vec
+    """radiance, already weighted by coverage"""
+    coverage: float
+    """0 .. 1: the share of it that is not sky"""
+    fits: float
+    """factor on the probe's weight: 0 where a window does not show the place at all"""
+    confidence: float
+    """0 .. 1: how far the proxy's guess of the distance can be trusted"""
 
 
 def camera_weight(probe: Probe, eye: NDArray[np.float64]) -> float:
@@ -135,19 +149,26 @@ def empty_table(probes: list[Probe], owned: list[bool], camera: Camera, rough: b
 
 
 @inlined
-def proxy_distance(table, k, p, d):  # type: ignore[no-untyped-def]
+def picture_of(table: ProbeTable, k: int) -> Picture:
+    """The levels of probe `k`, to be looked up."""
+    return Picture(table.texels, table.first[k], table.side[k], table.last[k])
+
+
+@inlined
+def proxy_distance(table: ProbeTable, k: int, p: Vec, d: Vec) -> float:
     """Distance from `p` along unit `d` to the proxy volume of probe `k`, at least 0 [m]."""
     if table.proxy_kind[k] == 2:
         return INFINITE_DISTANCE
     m = table.proxy[k]
     o, v = transform_point(m, p), transform_direction(m, d)
     e = row(table.proxy_extents, k)
+    # The volume's frame is turned and moved but not scaled, so a distance in it is one in the world.
     s = ray_sphere(o, v, e[0]) if table.proxy_kind[k] == 1 else ray_box(o, v, e)
     return max(s, 0.0)
 
 
 @inlined
-def influence(table, k, p, n, d):  # type: ignore[no-untyped-def]
+def influence(table: ProbeTable, k: int, p: Vec, n: Vec, d: Vec) -> float:
     """Weight 0 .. 1 of probe `k` at a point, for a ray along `d` from a surface with normal `n`."""
     m = table.influence[k]
     q = transform_point(m, p)
@@ -166,69 +187,75 @@ def influence(table, k, p, n, d):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def cube_at(table, k, d, lod):  # type: ignore[no-untyped-def]
-    """Trilinear (r, g, b, coverage, distance) of cube `k` in a direction, which need not be unit."""
+def cube_at(table: ProbeTable, k: int, d: Vec, lod: float) -> Texel:
+    """Trilinear texel of cube `k` in a direction, which need not be unit."""
     face, x, y = direction_face(d)
-    return level_at(table.texels, table.first[k], table.side[k], table.last[k], face, x, y, lod)
+    return level_at(picture_of(table, k), face, x, y, lod)
 
 
 @inlined
-def _cube_roughness(table, k, blur, roughness, hdrp, s, far):  # type: ignore[no-untyped-def]
+def _cube_roughness(table: ProbeTable, k: int, ray: Cone, hdrp: bool, s: float, far: float) -> float:
     """Perceptual roughness of the lobe that the cube shall be looked up with.
 
     The cone of half angle atan(`blur`) is blur s wide where it meets the proxy, and the capture sees that from `far`
     away: nothing has to be guessed about distance. HDRP's own way takes the material's roughness as it is, or lowered
     by its distance-based roughness (LightEvaluation.hlsl).
+
+    Args:
+        s: distance from the ray's origin to the proxy [m].
+        far: from the capture point to the same place [m].
     """
     if not hdrp:
-        return math.sqrt(min(1.0, 0.5 * blur * s / max(far, 1e-9)))
+        # The cone's tangent is twice the median slope of GGX, which is alpha, and alpha is roughness squared.
+        return math.sqrt(min(1.0, 0.5 * ray.blur * s / max(far, 1e-9)))
     if table.sharp_near[k] == 0 or table.proxy_kind[k] == 2:
-        return roughness
-    lowered = min(roughness, s / max(far, 1e-9) * roughness)
-    return lowered + (roughness - lowered) * roughness
+        return ray.roughness
+    lowered = min(ray.roughness, s / max(far, 1e-9) * ray.roughness)
+    return lowered + (ray.roughness - lowered) * ray.roughness
 
 
 @inlined
-def probe_light(table, k, p, d, blur, roughness, hdrp, environment, sky_follows):  # type: ignore[no-untyped-def]
-    """What probe `k` shows to a ray from `p` along unit `d`.
+def probe_light(
+    table: ProbeTable, k: int, ray: Cone, hdrp: bool, environment: EnvironmentTable, sky_follows: bool
+) -> ProbeLight:
+    """What probe `k` shows to a ray.
 
     Args:
-        blur: tangent of the half angle of the ray's cone.
-        roughness: perceptual, for HDRP's mapping, which `hdrp` asks for.
+        hdrp: roughness goes to levels by HDRP's mapping.
         sky_follows: a later tier will add the sky.
-
-    Returns:
-        (colour already weighted by coverage, coverage: the share of it that is not sky, factor on the probe's weight,
-        confidence: how far the proxy's guess of the distance can be trusted)
     """
-    s = proxy_distance(table, k, p, d)
-    meets = along(p, d, s)
+    # A picture knows what lies in a direction from the place it was taken at, not from the ray's origin. The proxy
+    # stands for the scene: where the ray meets it, the picture is asked.
+    s = proxy_distance(table, k, ray.origin, ray.direction)
+    meets = along(ray.origin, ray.direction, s)
     if table.planar[k] != 0:
         eye, m, e = table.eye[k], table.influence[k], row(table.influence_extents, k)
-        local = transform_point(m, meets)
-        face, x, y, far, width = window_of(eye, local, e, s * blur)
+        seen = window_of(eye, transform_point(m, meets), e, s * ray.blur)
         fits = 0.0
-        if face >= 0:
-            fits = window_weight(eye, transform_point(m, p), face, e, x, y)
+        if seen.face >= 0:
+            fits = window_weight(eye, transform_point(m, ray.origin), e, seen)
         if fits <= 0.0:
-            return (0.0, 0.0, 0.0), 1.0, 0.0, 0.0
-        texels = width / _AVERAGE_MEDIAN * table.side[k, 0]
+            return ProbeLight((0.0, 0.0, 0.0), 1.0, 0.0, 0.0)
+        # Averages are no lobes: level l has texels of 2^l, and the level is chosen whose texel blurs by the same
+        # median radius; the sum of squares is 1 at level 0, which has some blur of its own.
+        texels = seen.width / _AVERAGE_MEDIAN * table.side[k, 0]
         lod = 0.5 * math.log2(1.0 + texels * texels)
-        r, g, b, coverage, seen = level_at(table.texels, table.first[k], table.side[k], table.last[k], face, x, y, lod)
-        sky, gloss = d, math.sqrt(min(1.0, 0.5 * blur))
+        r, g, b, coverage, distance = level_at(picture_of(table, k), seen.face, seen.x, seen.y, lod)
+        sky, gloss, far = ray.direction, math.sqrt(min(1.0, 0.5 * ray.blur)), seen.distance
     else:
         fits = 1.0
         sky = sub(meets, row(table.capture, k))
         far = length(sky)
-        gloss = _cube_roughness(table, k, blur, roughness, hdrp, s, far)
-        r, g, b, coverage, seen = cube_at(table, k, sky, probe_lod_hdrp(gloss))
+        gloss = _cube_roughness(table, k, ray, hdrp, s, far)
+        r, g, b, coverage, distance = cube_at(table, k, sky, probe_lod_hdrp(gloss))
+    # The picture tells how far away the thing in it was; the nearer that is to the proxy, the better the guess.
     confidence = 0.0
-    if seen > 0.0 and far > 0.0:
-        confidence = min(seen, far) / max(seen, far)
+    if distance > 0.0 and far > 0.0:
+        confidence = min(distance, far) / max(distance, far)
     if coverage < 1.0 and not sky_follows:
         if environment.present:
             light = prefiltered(environment, sky, gloss)
             left = 1.0 - coverage
             r, g, b = r + light[0] * left, g + light[1] * left, b + light[2] * left
         coverage = 1.0
-    return scale((r, g, b), table.multiplier[k]), coverage, fits, confidence
+    return ProbeLight(scale((r, g, b), table.multiplier[k]), coverage, fits, confidence)

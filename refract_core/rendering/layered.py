@@ -7,26 +7,25 @@ from typing import Any
 
 import numpy as np
 
-from ..kernels.lanes import scratch
-from ..kernels.pointer import Pointer
+from ..kernels.lanes import by_address, scratch
 from ..models import BY_TOKEN
 from ..scene import Scene
 from ..settings import TIERS, RenderSettings
 from ..transport.layers import LayerScratch, new_layer_result, put_tile, refract_tile
 from ..transport.tiers import Asking
-from ..view.camera import View
+from ..view.camera import Tile, View
 from ..view.gbuffer import (
     OpaqueLayer,
+    RefractiveLayer,
     ViewScratch,
     new_refractive_layer,
     opaque_tile,
     peel_tile,
 )
 from ..view.planes import Planes, add_tile
-from ..view.pyramid import Screen, blur_level, fill_depth_levels, new_screen_buffers
+from ..view.pyramid import Screen, blur_level, fill_depth_levels, new_blur_scratch, new_screen_buffers
 from .integrator import Pass
 from .session import Session, is_rough
-from .work import Tile
 
 
 class Layered:
@@ -42,6 +41,7 @@ class Layered:
         self.model = int(BY_TOKEN[settings.model]) if settings.model else -1
         self.max_layers = settings.max_layers
         self.screen = new_screen_buffers(width, height, is_rough(scene))
+        self.blurring = by_address(new_blur_scratch(self.screen.color_level))
         # The opaque layer is level 0 of the screen's pyramids.
         self.opaque = OpaqueLayer(
             self.screen.color[: width * height].reshape(height, width, 3),
@@ -53,8 +53,8 @@ class Layered:
         self.result = new_layer_result(width, height)
 
     def passes(self, view: View, sample: int) -> Iterator[Pass]:
-        world, camera = self.session.world, Pointer(view)
-        behind, first, target = Pointer(self.opaque), Pointer(self.layers[0]), Pointer(self.planes)
+        world, camera = self.session.world, by_address(view)
+        behind, first, target = by_address(self.opaque), by_address(self.layers[0]), by_address(self.planes)
         busy: list[Tile] = []
         """tiles with glass in them"""
         inside: list[Tile] = []
@@ -79,7 +79,8 @@ class Layered:
             if used == len(self.layers):
                 self.layers.append(new_refractive_layer(*(int(n) for n in view.size)))
             found: list[int] = []
-            yield Pass(self._peeling(camera, Pointer(self.layers[used - 1]), Pointer(self.layers[used]), found), busy)
+            previous, here = by_address(self.layers[used - 1]), by_address(self.layers[used])
+            yield Pass(self._peeling(camera, previous, here, found), busy)
             if not any(found):
                 break
             used += 1
@@ -88,10 +89,10 @@ class Layered:
                 np.add(self.planes.layers, layer.part >= 0, out=self.planes.layers)
         for k in reversed(range(used if busy else 0)):
             yield from self._composited(view, sample, k, busy)
-        yield Pass(lambda tile: add_tile(target, behind, view.size, tile) or 0, self.tiles)
+        yield Pass(lambda tile: _without_rays(lambda: add_tile(target, behind, view.size, tile)), self.tiles)
 
     def _peeling(
-        self, camera: Pointer, previous: Pointer, here: Pointer, found: list[int], *, inside: bool = False
+        self, camera: View, previous: RefractiveLayer, here: RefractiveLayer, found: list[int], *, inside: bool = False
     ) -> Callable[[Tile], int]:
         """Finds the layer behind `previous`; how many pixels have one goes to `found`, tile by tile."""
 
@@ -115,13 +116,13 @@ class Layered:
 
             def blur() -> None:
                 for level in blurs:
-                    blur_level(screen.color, screen.color_level, level)
+                    blur_level(screen.color, screen.color_level, level, self.blurring)
 
             yield Pass(_without_rays, [levels, blur])
-        asking = Pointer(
-            Asking(self.order, self.by_proxy, Screen(view, *screen), session.probes.record, session.thing_probe)
+        asking = by_address(
+            Asking(self.order, self.by_proxy, Screen(view, *screen), session.table, session.thing_probe)
         )
-        layer, result, planes = Pointer(self.layers[k]), Pointer(self.result), Pointer(self.planes)
+        layer, result, planes = by_address(self.layers[k]), by_address(self.result), by_address(self.planes)
 
         def refract(tile: Tile) -> int:
             return int(
@@ -132,8 +133,8 @@ class Layered:
             )  # fmt: skip
 
         yield Pass(refract, busy)
-        picture = Pointer(self.opaque)
-        yield Pass(lambda tile: put_tile(layer, result, picture, view.size, tile) or 0, busy)
+        picture = by_address(self.opaque)
+        yield Pass(lambda tile: _without_rays(lambda: put_tile(layer, result, picture, view.size, tile)), busy)
 
 
 def _without_rays(job: Callable[[], Any]) -> int:

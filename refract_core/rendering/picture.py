@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..images.frame import Frame
 from ..kernels.compile import is_compiled
-from ..kernels.pointer import Pointer
+from ..kernels.lanes import by_address
 from ..kernels.sampling import pixel_offset
 from ..models import BY_TOKEN, SHEET, Behind
 from ..progress import COMPILING
@@ -103,7 +103,7 @@ def _draw(
         view = view_of(camera, *size, pixel_offset(sample))
         for step in integrator.passes(view, sample):
             rays += sum(work.run(step.draw, step.items))
-    finish = Pointer(finish_of(scene, settings.samples, camera.exposure_scale * 2.0**settings.exposure))
-    centred, target = Pointer(view_of(camera, *size)), Pointer(planes)
+    finish = by_address(finish_of(scene, settings.samples, camera.exposure_scale * 2.0**settings.exposure))
+    centred, target = by_address(view_of(camera, *size)), by_address(planes)
     work.run(lambda tile: finish_tile(target, centred, finish, tile), tiles)
     return by_name(planes), rays

@@ -11,16 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import UsageError
-from ..kernels.pointer import Pointer
+from ..kernels.lanes import by_address
 from ..probes.capture import cubemap_of, fill_table
-from ..probes.lookup import empty_table
+from ..probes.lookup import ProbeTable, empty_table
 from ..probes.plan import Plan, plan_capture, plan_picture
 from ..scene import Camera, Cubemap, Notice, Param, Probe, Scene
 from ..settings import RenderSettings
 from ..world import environment, textures
 from ..world.embree import Bvh
 from ..world.lights import pack_lights
-from ..world.tables import pack_geometry, pack_materials, world_of
+from ..world.tables import World, pack_geometry, pack_materials, world_of
 from .work import Cancel, Progress, Work, working
 
 _PROBE_SAMPLES = 4
@@ -30,9 +30,13 @@ _PROBE_SAMPLES = 4
 class Session(NamedTuple):
     """A scene made ready: tables, and the BVH they point into."""
 
-    world: Pointer
+    world: World
+    """by address"""
     bvh: Bvh
-    probes: Pointer
+    probes: ProbeTable
+    """by address"""
+    table: ProbeTable
+    """the same, for Python to read"""
     thing_probe: NDArray[np.int32]
     rays: int
     notices: tuple[Notice, ...]
@@ -65,7 +69,7 @@ def _prepare(
     scene: Scene, camera: Camera, chosen: Plan, rough: bool, samples: int, work: Work, span: tuple[float, float]
 ) -> Session:
     geometry, bvh, slots = pack_geometry(scene, chosen.captured_sets)
-    world = Pointer(
+    world = by_address(
         world_of(
             geometry,
             pack_materials(scene.materials, slots),
@@ -84,7 +88,7 @@ def _prepare(
 
     work.progress(span[0], "probes")
     rays = fill_table(table, entries, world, run, samples)
-    return Session(world, bvh, Pointer(table), chosen.thing_probe, rays, chosen.notices)
+    return Session(world, bvh, by_address(table), table, chosen.thing_probe, rays, chosen.notices)
 
 
 def capture_probes(
@@ -114,7 +118,7 @@ def capture_probes(
     with working(executor, jobs, progress, cancel) as work:
         chosen = plan_capture(scene, [replace(probe, cubemap=None) for probe in probes])
         session = _prepare(scene, choose_camera(scene, ""), chosen, True, samples, work, (0.0, 1.0))
-    return [cubemap_of(session.probes.record, k) for k in range(len(probes))]
+    return [cubemap_of(session.table, k) for k in range(len(probes))]
 
 
 def is_rough(scene: Scene) -> bool:

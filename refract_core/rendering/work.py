@@ -9,11 +9,10 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 from ..errors import Cancelled
+from ..view.camera import Tile
 
 Progress = Callable[[float, str], None]
 Cancel = Callable[[], bool]
-Tile = tuple[int, int, int, int]
-"""x0, y0, x1, y1 [pixels]"""
 
 
 class Work(NamedTuple):

@@ -17,9 +17,11 @@ from ..kernels.lanes import LANES, Column, Flags, Scalars, Vectors, Words
 from ..kernels.sampling import LEAF, Keys, Purpose, branched, key_of, set_key, unit_pair
 from ..kernels.vec import Vec, add, frame, normalize, row, scale
 from ..optics.interface import screen_lod_hdrp
+from ..optics.lobes import Cone
 from ..probes.lookup import ProbeTable, influence, probe_light, proxy_distance
 from ..probes.reach import next_of, piece_of
 from ..probes.volumes import update_headroom
+from ..view.camera import PixelPoint
 from ..view.pyramid import Screen
 from ..view.screen import screen_march, screen_proxy
 from ..world.embree import OPAQUE, SCATTERED, Packet, clear, set_ray
@@ -152,17 +154,17 @@ def ask(query: Query, asking: Asking, by_proxy: bool, work: TierScratch, world: 
 @inlined
 def _ask_screen(query: Query, lane: int, asking: Asking, by_proxy: bool) -> None:
     screen = asking.screen
-    origin, direction = row(query.origin, lane), row(query.direction, lane)
+    ray = Cone(row(query.origin, lane), row(query.direction, lane), query.blur[lane], query.roughness[lane])
     if by_proxy:
         k = asking.thing_probe[query.thing[lane]]
         if k < 0:
             return
-        distance = proxy_distance(asking.probes, k, origin, direction)
+        distance = proxy_distance(asking.probes, k, ray.origin, ray.direction)
         lod = screen_lod_hdrp(query.roughness[lane], screen.color_level.shape[0])
-        px, py = query.key.x[lane] + 0.5, query.key.y[lane] + 0.5
-        color, w, confidence = screen_proxy(screen, origin, direction, distance, px, py, query.z_self[lane], lod)
+        shaded = PixelPoint(query.key.x[lane] + 0.5, query.key.y[lane] + 0.5, query.z_self[lane])
+        color, w, confidence = screen_proxy(screen, ray, distance, shaded, lod)
     else:
-        color, w, confidence = screen_march(screen, origin, direction, query.blur[lane])
+        color, w, confidence = screen_march(screen, ray)
     _, w = update_headroom(1.0 - _headroom(query, lane), w)
     _add(query, lane, SCREEN, color, w, confidence)
 
@@ -191,10 +193,10 @@ def _ask_probe(
     w = influence(probes, k, origin, n, direction)
     if w <= 0.0:
         return
+    ray = Cone(origin, direction, query.blur[lane], query.roughness[lane])
     light, coverage, fits, confidence = probe_light(
-        probes, k, origin, direction, query.blur[lane], query.roughness[lane], by_proxy, world.environment,
-        sky_follows and world.environment.present,
-    )  # fmt: skip
+        probes, k, ray, by_proxy, world.environment, sky_follows and world.environment.present
+    )
     # The colour carries its own coverage; only the covered share of the weight is used up.
     _, w = update_headroom(1.0 - _headroom(query, lane), w * fits)
     for c in range(3):

@@ -13,8 +13,11 @@ from numpy.typing import NDArray
 
 from ..errors import UsageError
 from ..kernels.compile import inlined
-from ..kernels.vec import dot, normalize, row, sub
+from ..kernels.vec import Vec, dot, normalize, row, sub
 from ..scene import Camera
+
+Tile = tuple[int, int, int, int]
+"""x0, y0, x1, y1 [pixels]: from the first pixel to the one after the last. May reach beyond the picture."""
 
 
 class View(NamedTuple):
@@ -29,6 +32,17 @@ class View(NamedTuple):
     clipping: NDArray[np.float64]
     """shape (2,): near, far z_depth [m]"""
     orthographic: bool
+
+
+class PixelPoint(NamedTuple):
+    """A point as the camera sees it."""
+
+    x: float
+    """pixel coordinate, to the right"""
+    y: float
+    """pixel coordinate, downwards"""
+    z_depth: float
+    """[m]"""
 
 
 def image_size(camera: Camera, width: int, height: int) -> tuple[int, int]:
@@ -61,11 +75,11 @@ def view_of(camera: Camera, width: int, height: int, jitter: tuple[float, float]
 
 
 @inlined
-def pixel_ray(view, px, py):  # type: ignore[no-untyped-def]
+def pixel_ray(view: View, px: float, py: float) -> tuple[Vec, Vec, float]:
     """Ray through a pixel coordinate: origin [m], unit direction, cosine to the camera axis."""
     left, right, bottom, top = view.window[0], view.window[1], view.window[2], view.window[3]
     x = left + (right - left) * px / view.size[0]
-    y = top + (bottom - top) * py / view.size[1]
+    y = top + (bottom - top) * py / view.size[1]  # rows go down, the window's y goes up
     r, u, f, eye = row(view.axes, 0), row(view.axes, 1), row(view.axes, 2), row(view.axes, 3)
     if view.orthographic:
         origin = (eye[0] + r[0] * x + u[0] * y, eye[1] + r[1] * x + u[1] * y, eye[2] + r[2] * x + u[2] * y)
@@ -75,20 +89,20 @@ def pixel_ray(view, px, py):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def project(view, p):  # type: ignore[no-untyped-def]
-    """A world point to (px, py, z_depth). Meaningless px, py where z_depth <= 0 under perspective."""
+def project(view: View, p: Vec) -> PixelPoint:
+    """Where a world point [m] is seen. Its pixel means nothing where z_depth <= 0 under perspective."""
     left, right, bottom, top = view.window[0], view.window[1], view.window[2], view.window[3]
     v = sub(p, row(view.axes, 3))
     z = dot(v, row(view.axes, 2))
     w = 1.0 if view.orthographic else z
     x = dot(v, row(view.axes, 0)) / w
     y = dot(v, row(view.axes, 1)) / w
-    return (x - left) / (right - left) * view.size[0], (y - top) / (bottom - top) * view.size[1], z
+    return PixelPoint((x - left) / (right - left) * view.size[0], (y - top) / (bottom - top) * view.size[1], z)
 
 
 @inlined
-def pixel_point(view, px, py, z):  # type: ignore[no-untyped-def]
-    """The world point at a pixel coordinate and z_depth."""
+def pixel_point(view: View, px: float, py: float, z: float) -> Vec:
+    """The world point [m] at a pixel coordinate and z_depth [m]: the inverse of `project`."""
     grow = 1.0 if view.orthographic else z
     x = (view.window[0] + (view.window[1] - view.window[0]) * px / view.size[0]) * grow
     y = (view.window[3] + (view.window[2] - view.window[3]) * py / view.size[1]) * grow
@@ -101,7 +115,7 @@ def pixel_point(view, px, py, z):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def pixel_width(view, z):  # type: ignore[no-untyped-def]
-    """Width of a pixel at a z_depth [m]."""
+def pixel_width(view: View, z: float) -> float:
+    """Width of a pixel at a z_depth [m]; pixels are square."""
     w = (view.window[1] - view.window[0]) / view.size[0]
     return w if view.orthographic else w * z

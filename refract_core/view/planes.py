@@ -12,34 +12,49 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels.compile import kernel
-from ..kernels.vec import transform_direction, transform_point
+from ..kernels.vec import row, transform_direction, transform_point
 from ..scene import Scene
-from .camera import pixel_point
+from .camera import Tile, View, pixel_point
+from .gbuffer import OpaqueLayer
 
 F32 = NDArray[np.float32]
 
 
 class Planes(NamedTuple):
-    """One array per AOV, shape (H, W) or (H, W, C). The first group is summed, the second kept from sample 0."""
+    """One array per AOV, shape (H, W) or (H, W, C), float32, for the life of the frame. The first group is summed, the
+    second kept from sample 0; what is said of units and frames holds until `finish_tile`, which goes to the stage's."""
 
     beauty: F32
+    """(H, W, 4): radiance, and alpha"""
     mask: F32
+    """samples that met glass"""
     refraction: F32
+    """(H, W, 3): radiance that came through the nearest layer"""
     reflection: F32
+    """(H, W, 3): radiance that it reflected"""
     transmittance: F32
+    """(H, W, 3): what the glass left of the light"""
     screen: F32
+    """weight of a tier in what came through; so are the next three"""
     ray: F32
     probe: F32
     sky: F32
     none: F32
+    """weight that no tier answered"""
     confidence: F32
 
     normal: F32
+    """(H, W, 3): unit, engine world"""
     point: F32
+    """(H, W, 3): [stage units], stage; made by `finish_tile` alone"""
     z_depth: F32
+    """[m]; inf where nothing is"""
     thickness: F32
+    """[m]"""
     path_length: F32
+    """[m]"""
     layers: F32
+    """how many were met"""
 
 
 class Finish(NamedTuple):
@@ -52,6 +67,7 @@ class Finish(NamedTuple):
     unit: float
     """stage units per metre"""
     stage_from_engine: NDArray[np.float64]
+    """shape (4, 4), to stage units"""
     stage_rotation: NDArray[np.float64]
     """shape (3, 3)"""
 
@@ -93,8 +109,8 @@ def by_name(planes: Planes) -> dict[str, F32]:
 
 
 @kernel
-def finish_tile(planes, view, finish, tile):  # type: ignore[no-untyped-def]
-    """Sums to values over a tile (x0, y0, x1, y1)."""
+def finish_tile(planes: Planes, view: View, finish: Finish, tile: Tile) -> None:
+    """Sums to values over a tile, in place. `view`: without jitter."""
     for y in range(tile[1], min(tile[3], view.size[1])):
         for x in range(tile[0], min(tile[2], view.size[0])):
             for c in range(3):
@@ -103,13 +119,13 @@ def finish_tile(planes, view, finish, tile):  # type: ignore[no-untyped-def]
             z = planes.z_depth[y, x]
             if z < np.inf:
                 p = transform_point(finish.stage_from_engine, pixel_point(view, x + 0.5, y + 0.5, np.float64(z)))
-                normal = planes.normal[y, x]
-                towards = (np.float64(normal[0]), np.float64(normal[1]), np.float64(normal[2]))
-                n = transform_direction(finish.stage_rotation, towards)
+                n = transform_direction(finish.stage_rotation, row(planes.normal[y], x))
                 for c in range(3):
                     planes.point[y, x, c] = p[c]
                     planes.normal[y, x, c] = n[c]
                 planes.z_depth[y, x] = z * finish.unit
+            # How many samples met glass. What they saw of it is their mean, not that of all samples: at an edge a
+            # transmittance is that of the glass, and the mask says how much of the pixel it covers.
             covered = planes.mask[y, x]
             if covered == 0.0:
                 continue
@@ -129,8 +145,8 @@ def finish_tile(planes, view, finish, tile):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def add_tile(planes, opaque, size, tile):  # type: ignore[no-untyped-def]
-    """Add a finished sample's picture (an OpaqueLayer with its glass drawn in) to the beauty."""
+def add_tile(planes: Planes, opaque: OpaqueLayer, size: NDArray[np.int64], tile: Tile) -> None:
+    """Add a finished sample's picture (the opaque layer, its glass drawn in) to the beauty. `size`: width, height."""
     for y in range(tile[1], min(tile[3], size[1])):
         for x in range(tile[0], min(tile[2], size[0])):
             for c in range(3):

@@ -14,40 +14,56 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels.compile import inlined, kernel
+from ..kernels.vec import Vec
 from .camera import View
+
+F32 = NDArray[np.float32]
+Levels = NDArray[np.int64]
+"""shape (L, 3): of each level the first row in the pool, width, height"""
+
+_TAPS = np.array([1.0, 8.0, 28.0, 56.0, 70.0, 56.0, 28.0, 8.0, 1.0]) / 256.0
+"""Binomial weights: the blur of eight averages of neighbours."""
 
 
 class ScreenBuffers(NamedTuple):
     """Level 0 and its pyramids, in flat pools."""
 
-    color: NDArray[np.float32]
+    color: F32
     """shape (N, 3): all levels, row by row"""
-    color_level: NDArray[np.int64]
-    """shape (L, 3): first row in the pool, width, height"""
-    depth: NDArray[np.float32]
-    """shape (N,): nearest of each cell; level 0 is the depth itself"""
-    farthest: NDArray[np.float32]
+    color_level: Levels
+    depth: F32
+    """shape (N,): z_depth [m], nearest of each cell; level 0 is the depth itself"""
+    farthest: F32
     """shape (N,): farthest of each cell and the pixels next to it, background left out (0 where there is nothing else);
     level 0 is not used"""
-    depth_level: NDArray[np.int64]
-    """shape (D, 3)"""
-    normal: NDArray[np.float32]
+    depth_level: Levels
+    normal: F32
     """shape (H, W, 3): geometric, towards the viewer"""
 
 
 class Screen(NamedTuple):
-    """The buffers and the camera that filled them: what the screen tier reads."""
+    """The buffers and the camera that filled them, for one layer of one sample: what the screen tier reads."""
 
     camera: View
-    color: NDArray[np.float32]
-    color_level: NDArray[np.int64]
-    depth: NDArray[np.float32]
-    farthest: NDArray[np.float32]
-    depth_level: NDArray[np.int64]
-    normal: NDArray[np.float32]
+    color: F32
+    color_level: Levels
+    depth: F32
+    farthest: F32
+    depth_level: Levels
+    normal: F32
 
 
-def color_levels(width: int, height: int, blurred: bool) -> NDArray[np.int64]:
+class BlurScratch(NamedTuple):
+    """Where a colour level is on its way from the one below it: made once per picture size, of use to one thread. A
+    kernel finds nothing in it and leaves nothing to be used."""
+
+    half: F32
+    """shape (N, 3): averages of 2x2; N is the number of texels of level 1, the largest that is made"""
+    across: F32
+    """shape (N, 3): those, blurred along the rows"""
+
+
+def color_levels(width: int, height: int, blurred: bool) -> Levels:
     """Table of the colour levels; level 0 alone where nothing is going to be blurred."""
     levels = [(0, width, height)]
     while blurred and max(levels[-1][1:]) >= 8:
@@ -56,7 +72,8 @@ def color_levels(width: int, height: int, blurred: bool) -> NDArray[np.int64]:
     return np.array(levels, np.int64)
 
 
-def depth_levels(width: int, height: int) -> NDArray[np.int64]:
+def depth_levels(width: int, height: int) -> Levels:
+    """Table of the depth levels, down to a single cell."""
     levels = [(0, width, height)]
     while max(levels[-1][1:]) > 1:
         first, w, h = levels[-1]
@@ -68,7 +85,7 @@ def new_screen_buffers(w: int, h: int, blurred: bool) -> ScreenBuffers:
     """Empty pools of the right size; the opaque layer is drawn straight into their level 0."""
     colors, depths = color_levels(w, h, blurred), depth_levels(w, h)
 
-    def total(levels: NDArray[np.int64]) -> int:
+    def total(levels: Levels) -> int:
         return int((levels[:, 1] * levels[:, 2]).sum())
 
     return ScreenBuffers(
@@ -81,50 +98,53 @@ def new_screen_buffers(w: int, h: int, blurred: bool) -> ScreenBuffers:
     )
 
 
+def new_blur_scratch(levels: Levels) -> BlurScratch:
+    """Room for every level of a table of colour levels."""
+    texels = int(levels[1, 1] * levels[1, 2]) if len(levels) > 1 else 0
+    return BlurScratch(np.zeros((texels, 3), np.float32), np.zeros((texels, 3), np.float32))
+
+
 @inlined
-def _average_row(source, w, y, target, tw, row):  # type: ignore[no-untyped-def]
-    """2x2 averages of one destination row; a missing odd column or row repeats the edge."""
+def _average_row(source: F32, w: int, y: int, target: F32, tw: int) -> None:
+    """2x2 averages of row `y` of a level, tw texels wide; a missing odd column or row repeats the edge."""
     h = source.shape[0] // w
     ya, yb = min(2 * y, h - 1), min(2 * y + 1, h - 1)
     for x in range(tw):
         xa, xb = min(2 * x, w - 1), min(2 * x + 1, w - 1)
         for c in range(3):
             total = source[ya * w + xa, c] + source[ya * w + xb, c] + source[yb * w + xa, c] + source[yb * w + xb, c]
-            target[row * tw + x, c] = 0.25 * total
+            target[y * tw + x, c] = 0.25 * total
 
 
 @kernel
-def blur_level(color, levels, level):  # type: ignore[no-untyped-def]
+def blur_level(color: F32, levels: Levels, level: int, scratch: BlurScratch) -> None:
     """Make colour level `level` from the one below it."""
-    taps = np.array([1.0, 8.0, 28.0, 56.0, 70.0, 56.0, 28.0, 8.0, 1.0]) / 256.0
+    half, across = scratch.half, scratch.across
     first, w, h = levels[level - 1]
     source = color[first : first + w * h]
     first, tw, th = levels[level]
     target = color[first : first + tw * th]
-    half = np.zeros((tw * th, 3), np.float32)
     for y in range(th):
-        _average_row(source, w, y, half, tw, y)
-    line = np.zeros((tw, 3), np.float32)
-    across = np.zeros((tw * th, 3), np.float32)
+        _average_row(source, w, y, half, tw)
+    # The filter is a product of one along the rows and one down the columns: 18 taps in place of 81.
     for y in range(th):
         for x in range(tw):
             for c in range(3):
                 s = 0.0
                 for k in range(9):
-                    s += taps[k] * half[y * tw + min(tw - 1, max(0, x + k - 4)), c]
-                line[x, c] = s
-        across[y * tw : (y + 1) * tw] = line
+                    s += _TAPS[k] * half[y * tw + min(tw - 1, max(0, x + k - 4)), c]
+                across[y * tw + x, c] = s
     for y in range(th):
         for x in range(tw):
             for c in range(3):
                 s = 0.0
                 for k in range(9):
-                    s += taps[k] * across[min(th - 1, max(0, y + k - 4)) * tw + x, c]
+                    s += _TAPS[k] * across[min(th - 1, max(0, y + k - 4)) * tw + x, c]
                 target[y * tw + x, c] = s
 
 
 @kernel
-def fill_depth_levels(depth, farthest, levels):  # type: ignore[no-untyped-def]
+def fill_depth_levels(depth: F32, farthest: F32, levels: Levels) -> None:
     """Fill every level above 0 of the two depth pyramids from level 0 of `depth`."""
     for level in range(1, levels.shape[0]):
         first, w, h = levels[level - 1]
@@ -143,7 +163,7 @@ def fill_depth_levels(depth, farthest, levels):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _farthest_around(depth, w, h, x, y):  # type: ignore[no-untyped-def]
+def _farthest_around(depth: F32, w: int, h: int, x: int, y: int) -> np.float32:
     """Farthest of the 2x2 pixels from (x, y) and the ring around them, background left out: a surface inside a pixel
     may lie deeper than at its centre, but not deeper than at its neighbour's."""
     found = np.float32(0.0)
@@ -156,7 +176,7 @@ def _farthest_around(depth, w, h, x, y):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _bilinear(color, first, w, h, x, y):  # type: ignore[no-untyped-def]
+def _bilinear(color: F32, first: int, w: int, h: int, x: float, y: float) -> Vec:
     """Bilinear value at pixel coordinates (texel centres at +0.5), clamped to the edge."""
     x = min(max(x - 0.5, 0.0), w - 1.0)
     y = min(max(y - 0.5, 0.0), h - 1.0)
@@ -173,8 +193,9 @@ def _bilinear(color, first, w, h, x, y):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def color_at(screen, px, py, lod):  # type: ignore[no-untyped-def]
+def color_at(screen: Screen, px: float, py: float, lod: float) -> Vec:
     """Trilinear colour at a pixel coordinate of level 0."""
+    # Sizes are floored, so a level is not a power of two smaller: places are found by their share of the picture.
     last = screen.color_level.shape[0] - 1
     lod = min(max(lod, 0.0), float(last))
     low = int(lod)

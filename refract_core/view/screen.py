@@ -7,12 +7,14 @@ seen there. `proxy` is HDRP's way: one guess at a proxy volume, reprojected, wit
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from ..kernels.compile import inlined
-from ..kernels.vec import along, dot, row, sub
+from ..kernels.vec import Vec, along, dot, row, sub
+from ..optics.lobes import Cone
 from ..probes.volumes import edge_fade
-from .camera import pixel_point, pixel_width, project
-from .pyramid import color_at
+from .camera import PixelPoint, pixel_point, pixel_width, project
+from .pyramid import Screen, color_at
 
 SCREEN_FADE = 0.1
 """Screen Weight Distance (HDRP's default)."""
@@ -22,11 +24,34 @@ _BEHIND = 1.001  # ratio of depths beyond which a ray counts as behind a surface
 _LEVEL_MEDIAN = 1.92
 """Median radius of the colour pyramid's blur, in pixels of a level. Its variance is 8/3 (4^level - 1) pixels^2, from a
 binomial filter of 2 texels^2 on each level, and half of a round Gaussian lies within 1.177 deviations."""
+_SAME = 0.02  # part of the way from eye to hit by which two pixels of one surface may disagree
 _SLACK = 1.0  # how far outside its pixel a plane may be met, in pixels' worth of the ray
 
 
+class ScreenHit(NamedTuple):
+    """Where a ray meets a surface of the picture. It lives as long as one query."""
+
+    found: bool
+    x: float
+    """pixel coordinate, continuous; so is y"""
+    y: float
+    distance: float
+    """along the ray [m]"""
+
+
+class ScreenLight(NamedTuple):
+    """What the screen shows to one ray."""
+
+    color: Vec
+    """radiance"""
+    weight: float
+    """0 .. 1"""
+    confidence: float
+    """0 .. 1: how surely it is what the ray would have met"""
+
+
 @inlined
-def _cross_distance(boundary, a, b, aw, bw):  # type: ignore[no-untyped-def]
+def _cross_distance(boundary: float, a: float, b: float, aw: float, bw: float) -> float:
     """Ray distance at which pixel coordinate (a + t b) / (aw + t bw) reaches `boundary`; inf if it never does."""
     denominator = b - boundary * bw
     if denominator == 0.0:
@@ -35,7 +60,7 @@ def _cross_distance(boundary, a, b, aw, bw):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _plane_distance(screen, ix, iy, depth, origin, direction):  # type: ignore[no-untyped-def]
+def _plane_distance(screen: Screen, ix: int, iy: int, depth: float, origin: Vec, direction: Vec) -> float:
     """Ray distance to the plane of the surface seen in a pixel; -1 where the ray comes from behind or edge-on."""
     normal = row(screen.normal[iy], ix)
     facing = dot(direction, normal)
@@ -46,18 +71,16 @@ def _plane_distance(screen, ix, iy, depth, origin, direction):  # type: ignore[n
 
 
 @inlined
-def march(screen, origin, direction):  # type: ignore[no-untyped-def]
+def march(screen: Screen, origin: Vec, direction: Vec) -> ScreenHit:
     """First opaque surface of the picture that the ray meets.
 
     The ray is cut by the cells of the depth pyramid (Uludag, "Hi-Z Screen-Space Cone-Traced Reflections", GPU Pro 5,
     2014), in exact distances along the ray. A cell is skipped while the ray is nearer than everything in it.
-
-    Returns:
-        (found, px, py, hit distance [m]); pixel coordinates are continuous.
     """
     view = screen.camera
     width, height = int(view.size[0]), int(view.size[1])
-    # Homogeneous pixel coordinates, linear along the ray: (ax + t bx, ay + t by) / (aw + t bw).
+    # Homogeneous pixel coordinates, linear along the ray: (ax + t bx, ay + t by) / (aw + t bw). Stepping in them keeps
+    # t the distance in metres, which steps in pixels would not.
     left, right, bottom, top = view.window[0], view.window[1], view.window[2], view.window[3]
     sx, sy = width / (right - left), height / (bottom - top)
     o = sub(origin, row(view.axes, 3))
@@ -68,23 +91,28 @@ def march(screen, origin, direction):  # type: ignore[no-untyped-def]
     ay, by = (dot(o, y_axis) - top * aw) * sy, (dot(direction, y_axis) - top * bw) * sy
     near = view.clipping[0]
     if z <= near:
-        return False, 0.0, 0.0, 0.0
+        return ScreenHit(False, 0.0, 0.0, 0.0)
+    # Beyond the near plane, towards the eye, there are no pixels.
     end = (near - z) / dz if dz < 0.0 else math.inf
+    # The derivative of a quotient keeps its sign, so the ray crosses columns, and rows, in one direction only.
     step_x = 1 if bx * aw - ax * bw > 0.0 else -1
     step_y = 1 if by * aw - ay * bw > 0.0 else -1
-    ix, iy = math.floor(ax / aw), math.floor(ay / aw)
-    t = 0.0
-    level = 2
-    last = min(screen.depth_level.shape[0] - 1, 7)
-    level = min(level, last)
+
+    # State of the march.
+    ix, iy = math.floor(ax / aw), math.floor(ay / aw)  # the pixel the ray is in
+    t = 0.0  # distance at which it came into it [m]
+    last = min(screen.depth_level.shape[0] - 1, 7)  # coarsest level used: a cell of 128 pixels
+    level = min(2, last)  # of the cell that is asked
     for _ in range(_MAX_STEPS):
         if ix < 0 or iy < 0 or ix >= width or iy >= height or t >= end:
             break
+        # The stretch of the ray in this cell: from t to the first of the two edges it heads for.
         cx, cy = ix >> level, iy >> level
         edge_x = (cx + 1 if step_x > 0 else cx) << level
         edge_y = (cy + 1 if step_y > 0 else cy) << level
         tx = _cross_distance(edge_x, ax, bx, aw, bw)
         ty = _cross_distance(edge_y, ay, by, aw, bw)
+        # An edge just crossed may come out behind t by rounding; one far behind is never crossed again.
         tx = tx if tx > t else (t if tx > t - 1e-9 else math.inf)
         ty = ty if ty > t else (t if ty > t - 1e-9 else math.inf)
         out = min(tx, ty, end)
@@ -99,14 +127,17 @@ def march(screen, origin, direction):  # type: ignore[no-untyped-def]
             if level > 0:
                 level -= 1
                 continue
+            # A pixel is no block of the depth in it but a window onto a plane. That plane may be met a little outside
+            # of the pixel that shows it, where a neighbour shows the same surface; further off it is another one.
             s = _plane_distance(screen, ix, iy, nearest, origin, direction)
             slack = _SLACK * (out - t) if out < math.inf else math.inf
             if s > 0.0 and t - slack <= s <= out + slack:
                 px, py, _ = project(view, along(origin, direction, s))
                 if abs(px - ix - 0.5) <= 0.5 + _SLACK and abs(py - iy - 0.5) <= 0.5 + _SLACK:
-                    return True, px, py, s
+                    return ScreenHit(True, px, py, s)
         if out >= end:
             break
+        # On into the next cell, and a level up after a cell that was empty: long empty ways take few steps.
         t = out
         if tx <= ty:
             ix = edge_x if step_x > 0 else edge_x - 1
@@ -116,23 +147,23 @@ def march(screen, origin, direction):  # type: ignore[no-untyped-def]
             ix = _other(ax + t * bx, aw + t * bw, cx, level)
         if clear_of and level < last:
             level += 1
-    return False, 0.0, 0.0, 0.0
+    return ScreenHit(False, 0.0, 0.0, 0.0)
 
 
 @inlined
-def _other(a, w, cell, level):  # type: ignore[no-untyped-def]
+def _other(a: float, w: float, cell: int, level: int) -> int:
     """Pixel index of the coordinate that does not cross, kept inside the cell it is in."""
     low = cell << level
     return min(max(math.floor(a / w), low), low + (1 << level) - 1)
 
 
 @inlined
-def _on_surface(screen, px, py, origin, direction, s):  # type: ignore[no-untyped-def]
+def _on_surface(screen: Screen, origin: Vec, direction: Vec, hit: ScreenHit) -> Vec:
     """Bilinear colour of the four nearest pixels, leaving out those that show another surface."""
     width, height = int(screen.camera.size[0]), int(screen.camera.size[1])
-    x, y = px - 0.5, py - 0.5
+    x, y = hit.x - 0.5, hit.y - 0.5
     x0, y0 = math.floor(x), math.floor(y)
-    _, _, z = project(screen.camera, along(origin, direction, s))
+    _, _, z = project(screen.camera, along(origin, direction, hit.distance))
     r = g = b = total = 0.0
     for k in range(4):
         ix, iy = x0 + k % 2, y0 + k // 2
@@ -141,8 +172,9 @@ def _on_surface(screen, px, py, origin, direction, s):  # type: ignore[no-untype
         depth = screen.depth[iy * width + ix]
         if depth == math.inf:
             continue
+        # Pixels of one surface agree on where the ray meets it; those that do not, or are sky, show something else.
         met = _plane_distance(screen, ix, iy, depth, origin, direction)
-        if met < 0.0 or abs(met - s) > 0.02 * (s + z):
+        if met < 0.0 or abs(met - hit.distance) > _SAME * (hit.distance + z):
             continue
         i = iy * width + ix
         r += w * screen.color[i, 0]
@@ -151,57 +183,48 @@ def _on_surface(screen, px, py, origin, direction, s):  # type: ignore[no-untype
         total += w
     if total > 1e-3:
         return (r / total, g / total, b / total)
-    return color_at(screen, px, py, 0.0)
+    return color_at(screen, hit.x, hit.y, 0.0)
 
 
 @inlined
-def screen_march(screen, origin, direction, blur):  # type: ignore[no-untyped-def]
-    """Colour and weight of the march.
-
-    Args:
-        blur: tangent of the half angle of the rough cone; the pyramid level is chosen so that half of its blur falls
-            within the cone at the hit.
-
-    Returns:
-        (colour, weight 0 .. 1, confidence 0 .. 1)
-    """
-    found, px, py, s = march(screen, origin, direction)
-    if not found:
-        return (0.0, 0.0, 0.0), 0.0, 0.0
-    w = edge_fade(px / screen.camera.size[0], py / screen.camera.size[1], SCREEN_FADE)
+def screen_march(screen: Screen, ray: Cone) -> ScreenLight:
+    """What the march finds; the level of the pyramid is such that half of its blur falls within the cone at the hit."""
+    hit = march(screen, ray.origin, ray.direction)
+    if not hit.found:
+        return ScreenLight((0.0, 0.0, 0.0), 0.0, 0.0)
+    w = edge_fade(hit.x / screen.camera.size[0], hit.y / screen.camera.size[1], SCREEN_FADE)
     if w <= 0.0:
-        return (0.0, 0.0, 0.0), 0.0, 0.0
+        return ScreenLight((0.0, 0.0, 0.0), 0.0, 0.0)
     lod = 0.0
-    if blur > 0.0:
-        _, _, z = project(screen.camera, along(origin, direction, s))
-        radius = blur * s / pixel_width(screen.camera, max(z, 1e-6)) / _LEVEL_MEDIAN
+    if ray.blur > 0.0:
+        _, _, z = project(screen.camera, along(ray.origin, ray.direction, hit.distance))
+        radius = ray.blur * hit.distance / pixel_width(screen.camera, max(z, 1e-6)) / _LEVEL_MEDIAN
         lod = 0.5 * math.log2(1.0 + radius * radius)
     if lod > 0.0:
-        return color_at(screen, px, py, lod), w, 1.0
-    return _on_surface(screen, px, py, origin, direction, s), w, 1.0
+        return ScreenLight(color_at(screen, hit.x, hit.y, lod), w, 1.0)
+    return ScreenLight(_on_surface(screen, ray.origin, ray.direction, hit), w, 1.0)
 
 
 @inlined
-def screen_proxy(screen, origin, direction, distance, px_self, py_self, z_self, lod):  # type: ignore[no-untyped-def]
-    """Colour and weight of HDRP's reprojection (Lit.hlsl, ScreenSpaceTracing.hlsl).
+def screen_proxy(screen: Screen, ray: Cone, distance: float, shaded: PixelPoint, lod: float) -> ScreenLight:
+    """HDRP's reprojection (Lit.hlsl, ScreenSpaceTracing.hlsl); its confidence is how well the proxy guessed the depth.
 
     Args:
         distance: to the proxy volume along the ray [m].
-        px_self, py_self, z_self: the shaded pixel and its own z_depth.
+        shaded: the surface the ray comes from, as the camera sees it.
         lod: level of the colour pyramid.
-
-    Returns:
-        (colour, weight 0 .. 1, confidence 0 .. 1: how well the proxy guessed the depth that is there)
     """
     width, height = int(screen.camera.size[0]), int(screen.camera.size[1])
-    px, py, z = project(screen.camera, along(origin, direction, distance))
+    px, py, z = project(screen.camera, along(ray.origin, ray.direction, distance))
     if z <= 0.0:
-        return (0.0, 0.0, 0.0), 0.0, 0.0
+        return ScreenLight((0.0, 0.0, 0.0), 0.0, 0.0)
     w = edge_fade(px / width, py / height, SCREEN_FADE)
     if w <= 0.0:
-        return (0.0, 0.0, 0.0), 0.0, 0.0
+        return ScreenLight((0.0, 0.0, 0.0), 0.0, 0.0)
+    # What is in front of the shaded surface cannot be behind it in the glass: then the lookup stays at its own pixel.
+    # The rougher the lobe, the less it moves, since a coarse texel already holds both places.
     there = screen.depth[min(int(py), height - 1) * width + min(int(px), width - 1)]
-    keep = max(0.0, 1.0 - 0.08 * lod) if there > z_self else 0.0
-    color = color_at(screen, px_self + (px - px_self) * keep, py_self + (py - py_self) * keep, lod)
+    keep = max(0.0, 1.0 - 0.08 * lod) if there > shaded.z_depth else 0.0
+    color = color_at(screen, shaded.x + (px - shaded.x) * keep, shaded.y + (py - shaded.y) * keep, lod)
     confidence = min(z, there) / max(z, there) if there < math.inf else 0.0
-    return color, w, confidence * keep
+    return ScreenLight(color, w, confidence * keep)
