@@ -22,8 +22,7 @@ from pathlib import Path
 
 import refract_core as rc
 from refract_core.kernels.compile import kernel
-from refract_core.kernels.lanes import LANES, scratch
-from refract_core.kernels.pointer import Pointer
+from refract_core.kernels.lanes import LANES, by_address, scratch
 from refract_core.rendering.work import tiles_of
 from refract_core.view.camera import image_size, view_of
 from refract_core.view.gbuffer import ViewScratch, add_view_ray
@@ -52,7 +51,7 @@ def bare_tile(handle, view, work, tile):  # type: ignore[no-untyped-def]
 def bare_seconds_per_ray(scene: rc.Scene, width: int, height: int, jobs: int, repeat: int) -> float:
     """Best run of the camera's rays alone on `jobs` threads."""
     geometry, bvh, _slots = pack_geometry(scene)
-    view = Pointer(view_of(scene.cameras[0], width, height))
+    view = by_address(view_of(scene.cameras[0], width, height))
     tiles = tiles_of(width, height, 64)
     best = float("inf")
     with ThreadPoolExecutor(jobs) as pool:

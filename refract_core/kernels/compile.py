@@ -16,7 +16,6 @@ from .store import cache_root, keep_nothing
 
 __all__ = ["External", "cache_root", "flag", "inlined", "is_compiled", "keep_nothing", "kernel", "leaf", "word"]
 
-T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
 
 
@@ -101,7 +100,7 @@ class External:
             _jit().bind(self.name, address)
 
 
-def kernel(function: Callable[..., T]) -> Callable[..., T]:
+def kernel(function: F) -> F:
     """Compile `function` when first called (or load it), to run without the GIL.
 
     Division by zero gives inf or NaN as in numpy, never an exception: a ray that fails is a status.

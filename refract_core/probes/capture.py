@@ -16,7 +16,8 @@ from ..kernels.vec import along, length, normalize, row, scale, transform_direct
 from ..scene import Cubemap
 from ..world.embree import COHERENT, Packet, clear, set_ray
 from ..world.shading import Block, load_hits, shade
-from ..world.tracing import World, intersect_world
+from ..world.tables import World
+from ..world.tracing import intersect_world
 from .faces import (
     CUBE,
     TEXEL,

@@ -17,8 +17,8 @@ from ..kernels.sampling import Key, set_key
 from ..kernels.vec import dot, row, scale
 from ..optics.interface import channel_iors, fresnel_dielectric, reflect, transmitted_roughness
 from ..scene import Param
-from ..view.camera import View
-from ..view.gbuffer import OpaqueLayer, RefractiveLayer, Tile, view_point
+from ..view.camera import Tile, View
+from ..view.gbuffer import OpaqueLayer, RefractiveLayer, view_point
 from ..view.planes import Planes
 from ..world.embree import OPAQUE
 from ..world.offsets import off_surface

@@ -32,14 +32,10 @@ from ..world.shading import Block, load_hits, shade
 from ..world.surface import NOTHING, Hit, Interaction, Ray, hit_in, interaction
 from ..world.tables import World
 from ..world.tracing import intersect_world, ray_of
-from .camera import View, pixel_ray
+from .camera import Tile, View, pixel_ray
 
 _MAX_SKIPS = 64
 """Inner sides of glass that a view ray may pass before it enters one."""
-
-Tile = tuple[int, int, int, int]
-"""x0, y0, x1, y1 [pixels]; x0 and y0 are multiples of 4"""
-
 
 class ViewScratch(NamedTuple):
     """What one thread needs to look at a block of pixels."""
