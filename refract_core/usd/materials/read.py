@@ -206,14 +206,18 @@ def _refraction(context: Context, material: UsdShade.Material, surface: Surface,
     abbe = read_number(context, material.GetInput("refraction:abbeNumber"), 0.0)
     if abbe < 0.0:
         note(context, f"inputs:refraction:abbeNumber is {abbe}; the valid range is at least 0; 0 (none) is used")
-    priority = material.GetPrim().GetAttribute("refraction:priority")
+    attribute = material.GetPrim().GetAttribute("refraction:priority")
+    priority = int((attribute.Get() if attribute else None) or 0)
+    if priority:
+        note(context, f"refraction:priority is {priority}, which does nothing yet: where media overlap, the one that the "
+             "ray entered first goes on to its own far side; model the media without overlap")  # fmt: skip
     return _with(
         row,
         changes,
         model=model,
         absorption_distance=_absorption_distance(context, material, model, unit),
         abbe=max(abbe, 0.0),
-        priority=int((priority.Get() if priority else None) or 0),
+        priority=priority,
     )
 
 
