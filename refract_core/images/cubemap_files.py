@@ -5,7 +5,7 @@ What `write_cubemap` writes is a tiled OpenEXR file with MIP levels, which any r
 - Channels R G B (half, scene-linear, multiplied by coverage, at most 65504), A (half, coverage: 0 where the sky is
   seen) and Z (float, distance along the ray in metres, 0 where it is not known).
 - Faces +x -x +y -y +z -z of the stage's world as the engine has it (right-handed, Y up, metres), looked at from the
-  middle; `scene.Cubemap` says which way each lies, and `cubemaps` how strip, cross and latlong arrange them.
+  middle; `scene.Cubemap` says which way each lies, and `layouts` how strip, cross and latlong arrange them.
 - MIP level m holds the faces blurred by the GGX lobe that level stands for (`scene.CUBE_LEVELS`), as long as the layout
   halves exactly; `refract:levels` counts them. The levels below, which the format asks for, are plain averages.
 - `refract:layout` is the layout, `refract:resolution` the side of a face [texels].
@@ -22,8 +22,8 @@ import numpy as np
 from ..errors import ImageError, UsageError
 from ..files import replacing
 from ..scene import CUBE_LEVELS, F32, Cubemap
-from .cubemaps import LAYOUTS, arrange, faces_of, halved
-from .files import HALF_MAX, check_size, extension_of, memory_file, named_file, read_pixels, reason
+from .layouts import LAYOUTS, arrange, faces_of, halved
+from .codec import HALF_MAX, check_size, extension_of, memory_file, named_file, read_pixels, reason
 from .srgb import srgb_decode
 
 CHANNELS = ("R", "G", "B", "A", "Z")
@@ -42,7 +42,7 @@ def write_cubemap(
     """Write a cubemap to an .exr file, in one step: the file appears whole, or not at all. Equal input, equal bytes.
 
     Args:
-        layout: one of `cubemaps.LAYOUTS`.
+        layout: one of `layouts.LAYOUTS`.
         metadata: more attributes of the file; `read_notes` gives back those that begin with `refract:`.
 
     Raises:

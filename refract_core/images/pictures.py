@@ -17,7 +17,7 @@ from ..files import check_place, replacing
 from ..scene import F32, Texture
 from .aovs import AOVS, check_names, shape_of
 from .cubemap_files import read_cubemap, read_notes, write_cubemap
-from .files import HALF_MAX, MAX_TEXTURE_PIXELS, encoded, extension_of, named_file, read_pixels, reason
+from .codec import HALF_MAX, MAX_TEXTURE_PIXELS, encoded, extension_of, named_file, read_pixels, reason
 from .srgb import srgb_decode, srgb_encode
 
 __all__ = [

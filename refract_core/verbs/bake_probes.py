@@ -14,7 +14,7 @@ from typing import Any, Protocol
 from ..errors import Cancelled, ImageError, UsageError
 from ..files import replacing
 from ..images.bake_files import Baked, Task, batches, file_names, size_text, texture_folder
-from ..images.cubemaps import LAYOUTS
+from ..images.layouts import LAYOUTS
 from ..probes.digest import probe_digest
 from ..progress import Report
 from ..scene import Cubemap, Notice, Probe, Scene
