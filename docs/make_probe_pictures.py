@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import refract_core as rc
+from refract_core.images.cubemaps import write_cubemap
 from refract_core.images.layouts import arrange
-from refract_core.images.pictures import display, read_texture, write_cubemap, write_frame
+from refract_core.images.pictures import display, read_texture, write_frame
 from refract_core.images.srgb import srgb_encode
 from refract_core.progress import Report
 from refract_core.rendering.session import capture_probes

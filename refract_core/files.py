@@ -49,6 +49,16 @@ def replacing(path: str, error: type[RefractError]) -> Iterator[str]:
         Path(temporary).unlink(missing_ok=True)
 
 
+def write_whole(path: str, data: bytes, error: type[RefractError]) -> None:
+    """Write a file in one step: it appears whole, or not at all.
+
+    Raises:
+        error: the file cannot be written.
+    """
+    with replacing(path, error) as temporary:
+        Path(temporary).write_bytes(data)
+
+
 @contextmanager
 def folder_beside(out: str, suffix: str) -> Iterator[str]:
     """Where files go that OUT refers to: `shot.suffix` beside `shot.usda`, for whoever writes to make; for a package,

@@ -263,7 +263,7 @@ class Bake:
     """What a baked texture was made from, as written down beside it."""
 
     digest: str
-    """`refract_core.digest.probe_digest` of the scene at `time_code`"""
+    """`probes.digest.probe_digest` of the scene at `time_code`"""
     engine: str
     """version of refract"""
     time_code: float

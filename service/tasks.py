@@ -42,9 +42,9 @@ def perform(kind: str, stage: str, out: str, settings: Mapping[str, Any], limits
     Raises:
         Problem: for the client.
     """
-    from refract_core.images import files as image_files
+    from refract_core.images import codec
 
-    image_files.MAX_TEXTURE_PIXELS = min(image_files.MAX_TEXTURE_PIXELS, limits["texture_pixels"])
+    codec.MAX_TEXTURE_PIXELS = min(codec.MAX_TEXTURE_PIXELS, limits["texture_pixels"])
     try:
         return _VERBS[kind](stage, out, settings, limits, say)
     except StageError as error:

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from refract_core.cli import app
 from refract_core.errors import Cancelled, ImageError, StageError
 from refract_core.images.bake_files import Task, batches
-from refract_core.images.pictures import read_notes
+from refract_core.images.cubemaps import read_notes
 from refract_core.probes.digest import probe_digest
 from refract_core.scene import Bake, Scene
 from refract_core.usd.stage import load_stage

@@ -13,7 +13,7 @@ from pxr import Sdf
 
 from refract_core.errors import UsageError
 from refract_core.images.bake_files import file_names
-from refract_core.images.pictures import read_cubemap, read_notes
+from refract_core.images.cubemaps import read_cubemap, read_notes
 from refract_core.probes.digest import probe_digest
 from refract_core.scene import CUBE_LEVELS
 from refract_core.usd.stage import load_stage

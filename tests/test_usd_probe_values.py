@@ -11,7 +11,7 @@ from probe_reading import cubemap, open_text, planar, probe, read, read_one, rea
 from pxr import Sdf, Usd, UsdUtils
 
 from refract_core.errors import ImageError, StageError
-from refract_core.images.pictures import write_cubemap
+from refract_core.images.cubemaps import write_cubemap
 from refract_core.scene import CUBE_LEVELS, Bake, Cubemap, Notice
 from refract_core.usd.probes import pictures as probe_pictures
 from refract_core.usd.probes.read import read_probes
@@ -130,7 +130,7 @@ def decoded(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str | bytes, str, int
         given.append((source, name, resolution))
         return cubemap(name, resolution)
 
-    monkeypatch.setattr("refract_core.images.pictures.read_cubemap", decode)
+    monkeypatch.setattr("refract_core.images.cubemaps.read_cubemap", decode)
     return given
 
 

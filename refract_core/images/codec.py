@@ -1,10 +1,13 @@
-"""Image files as bytes and pixels: what reading and writing pictures and cubemaps share. Knows OpenImageIO."""
+"""Image files as bytes and pixels: what reading and writing pictures and cubemaps share.
+
+OpenImageIO is loaded with the first file, never with this module.
+"""
 
 from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,8 +20,7 @@ from ..errors import ImageError
 MAX_TEXTURE_PIXELS = 1 << 28
 HALF_MAX = 65504.0
 
-_PNG_END = b"IEND\xaeB`\x82"
-_STRAIGHT_ALPHA = "oiio:UnassociatedAlpha"
+STRAIGHT_ALPHA = "oiio:UnassociatedAlpha"
 
 
 def extension_of(path: str) -> str:
@@ -68,11 +70,11 @@ class Pixels(NamedTuple):
 
 
 def read_pixels(path: str, name: str) -> Pixels:
-    """Decode the first image in a file; see `refract_core.image.read_texture`."""
+    """Decode the first image in a file; see `pictures.read_texture`."""
     import OpenImageIO as oiio
 
     config = oiio.ImageSpec()
-    config.attribute(_STRAIGHT_ALPHA, 1)
+    config.attribute(STRAIGHT_ALPHA, 1)
     file = oiio.ImageInput.open(path, config)
     if file is None:
         raise ImageError(f"{name}: not a readable image: {reason(oiio.geterror(), path)}")
@@ -85,7 +87,7 @@ def read_pixels(path: str, name: str) -> Pixels:
         if pixels is None:
             raise ImageError(f"{name}: damaged image: {reason(file.geterror(), path)}")
         pixels = pixels.reshape(spec.height, spec.width, spec.nchannels)
-        straight = bool(spec.get_int_attribute(_STRAIGHT_ALPHA, 0))
+        straight = bool(spec.get_int_attribute(STRAIGHT_ALPHA, 0))
         return Pixels(_rgba(_display_window(pixels, spec), spec), spec.nchannels, integer, straight)
     finally:
         file.close()
@@ -144,6 +146,29 @@ def _rgba(pixels: NDArray[Any], spec: Any) -> NDArray[Any]:
 # --- writing -----------------------------------------------------------------------------------------------------
 
 
+def exr_spec(
+    width: int, height: int, channels: Sequence[str], formats: Sequence[str], metadata: Mapping[str, str | float]
+) -> Any:
+    """OpenImageIO's description of an EXR file whose bytes depend on nothing but what is written.
+
+    Args:
+        channels: names, in the order of the pixels' last axis.
+        formats: `half` or `float` for each channel.
+        metadata: attributes of the file.
+    """
+    import OpenImageIO as oiio
+
+    spec = oiio.ImageSpec(width, height, len(channels), formats[0] if len(formats) == 1 else "float")
+    spec.channelnames = tuple(channels)
+    if len(formats) > 1:  # of a single channel OpenImageIO passes them over
+        spec.channelformats = tuple(oiio.TypeDesc(one) for one in formats)
+    spec.attribute("compression", "zip")
+    spec.attribute("DateTime", "")  # else the writer stamps the time, and equal pictures make unequal files
+    for key, value in metadata.items():
+        spec.attribute(key, value)
+    return spec
+
+
 def encoded(path: str, pixels: NDArray[Any], spec: Any) -> bytes:
     """The whole file in memory: on a full disk some writers say nothing, and one ends the process.
 
@@ -163,6 +188,6 @@ def encoded(path: str, pixels: NDArray[Any], spec: Any) -> bytes:
         if not (written and closed):
             raise ImageError(f"{path}: cannot be encoded: {reason(file.geterror(), name)}")
         data = Path(name).read_bytes()
-    if extension_of(path) == ".png" and not data.endswith(_PNG_END):
+    if extension_of(path) == ".png" and not data.endswith(b"IEND\xaeB`\x82"):  # the last chunk of every PNG
         raise ImageError(f"{path}: cannot be encoded: out of memory, or over the limit on file sizes")
     return data

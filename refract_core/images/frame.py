@@ -23,7 +23,7 @@ class Frame:
     height: int
     """[pixels]"""
     planes: dict[str, F32]
-    """AOV name (`refract_core.aovs.AOVS`) -> float32. `beauty` has shape (H, W, 4), scene-linear with premultiplied
+    """AOV name (`aovs.AOVS`) -> float32. `beauty` has shape (H, W, 4), scene-linear with premultiplied
     alpha; colours and vectors (H, W, 3); scalars (H, W). `N` and `P` are in the stage's world."""
     metadata: dict[str, str | float] = field(default_factory=dict)
     """Written into the file: what made the picture."""

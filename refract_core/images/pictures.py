@@ -1,38 +1,19 @@
-"""Image files in and out: textures, pictures, and (from the room beside it) cubemaps.
-
-OpenImageIO is known here, in `image_files` and in `image_cubemaps` alone, and loaded with the first file.
-"""
+"""Flat image files in and out: textures of a stage, planes of a frame, maps of one number per texel."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ImageError, UsageError
-from ..files import check_place, replacing
+from ..files import check_place, write_whole
 from ..scene import F32, Texture
 from .aovs import AOVS, check_names, shape_of
-from .cubemap_files import read_cubemap, read_notes, write_cubemap
-from .codec import HALF_MAX, MAX_TEXTURE_PIXELS, encoded, extension_of, named_file, read_pixels, reason
+from .codec import HALF_MAX, STRAIGHT_ALPHA, encoded, exr_spec, extension_of, named_file, read_pixels, reason
 from .srgb import srgb_decode, srgb_encode
-
-__all__ = [
-    "MAX_TEXTURE_PIXELS",
-    "check_output",
-    "check_writable",
-    "default_aovs",
-    "display",
-    "read_cubemap",
-    "read_notes",
-    "read_texture",
-    "write_cubemap",
-    "write_frame",
-    "write_map",
-]
 
 COLOR_SPACES = ("auto", "raw", "sRGB")
 COLOR_CORRECTIONS = ("disabled", "sRGB", "openColorIO")
@@ -41,8 +22,6 @@ EIGHT_BIT = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 _PNG_LEVEL, _PNG_SUB = 4, 0x10
 """zlib's level, and libpng's flag for differences to the left neighbour: written in half the time the defaults take, at
 about the same size."""
-_STRAIGHT_ALPHA = "oiio:UnassociatedAlpha"
-_LINEAR_REC709 = "lin_rec709_scene"
 
 
 # --- reading -----------------------------------------------------------------------------------------------------
@@ -125,7 +104,7 @@ def write_frame(
     Args:
         path: `.exr` takes any planes as scene-linear channels, colours as half and data as float32; the 8-bit formats
             take exactly one.
-        planes: AOV name -> float32, shapes as `refract_core.aovs.shape_of`.
+        planes: AOV name -> float32, shapes as `aovs.shape_of`.
         metadata: attributes of the file, where the format has a place for them (EXR; PNG as text).
         color_correction: `sRGB`, `disabled` or `openColorIO`; colours in 8-bit files only.
 
@@ -146,9 +125,7 @@ def write_frame(
     else:
         ((name, plane),) = planes.items()
         pixels, spec = _eight_bit(path, name, plane, metadata, color_correction)
-    data = encoded(path, pixels, spec)
-    with replacing(path, ImageError) as temporary:
-        Path(temporary).write_bytes(data)
+    write_whole(path, encoded(path, pixels, spec), ImageError)
 
 
 def write_map(path: str, plane: F32, metadata: Mapping[str, str | float]) -> None:
@@ -162,19 +139,11 @@ def write_map(path: str, plane: F32, metadata: Mapping[str, str | float]) -> Non
         UsageError: not an .exr file.
         ImageError: the file cannot be written.
     """
-    import OpenImageIO as oiio
-
     if _extension(path) not in LAYERED:
         raise UsageError(f"{path}: a map is written as .exr; change the extension")
-    spec = oiio.ImageSpec(plane.shape[1], plane.shape[0], 1, "half")
-    spec.channelnames = ("Y",)
-    spec.attribute("compression", "zip")
-    spec.attribute("DateTime", "")
-    for key, value in metadata.items():
-        spec.attribute(key, value)
-    data = encoded(path, np.ascontiguousarray(np.clip(plane, -HALF_MAX, HALF_MAX))[..., None], spec)
-    with replacing(path, ImageError) as temporary:
-        Path(temporary).write_bytes(data)
+    spec = exr_spec(plane.shape[1], plane.shape[0], ("Y",), ("half",), metadata)
+    pixels = np.ascontiguousarray(np.clip(plane, -HALF_MAX, HALF_MAX))[..., None]
+    write_whole(path, encoded(path, pixels, spec), ImageError)
 
 
 def _extension(path: str) -> str:
@@ -186,8 +155,6 @@ def _extension(path: str) -> str:
 
 
 def _exr(planes: Mapping[str, F32], metadata: Mapping[str, str | float], height: int, width: int) -> tuple[F32, Any]:
-    import OpenImageIO as oiio
-
     names: list[str] = []
     formats: list[str] = []
     columns: list[F32] = []
@@ -198,14 +165,8 @@ def _exr(planes: Mapping[str, F32], metadata: Mapping[str, str | float], height:
         column = plane.reshape(height, width, len(aov.channels))
         # A colour beyond the largest half would become infinity, which no viewer averages well.
         columns.append(np.clip(column, -HALF_MAX, HALF_MAX) if aov.color else column)
-    spec = oiio.ImageSpec(width, height, len(names), "float")
-    spec.channelnames = tuple(names)
-    spec.channelformats = tuple(oiio.TypeDesc(one) for one in formats)
-    spec.attribute("compression", "zip")
-    spec.attribute("DateTime", "")  # else the writer stamps the time, and equal pictures make unequal files
-    for key, value in metadata.items():
-        spec.attribute(key, value)
-    return np.ascontiguousarray(np.concatenate(columns, axis=2), dtype=np.float32), spec
+    pixels = np.ascontiguousarray(np.concatenate(columns, axis=2), dtype=np.float32)
+    return pixels, exr_spec(width, height, names, formats, metadata)
 
 
 def _eight_bit(
@@ -221,7 +182,7 @@ def _eight_bit(
         pixels = np.ascontiguousarray(display(name, over_black, color_correction)[..., :3])
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, "uint8")
-    spec.attribute(_STRAIGHT_ALPHA, 1)
+    spec.attribute(STRAIGHT_ALPHA, 1)
     spec.attribute("DateTime", "")
     if AOVS[name].color and color_correction == "sRGB":
         spec.attribute("oiio:ColorSpace", "srgb_rec709_scene")
@@ -240,7 +201,7 @@ def display(name: str, plane: F32, color_correction: str = "sRGB") -> NDArray[np
 
     Args:
         name: the AOV.
-        plane: float32, shape as `refract_core.aovs.shape_of`; `beauty` is premultiplied.
+        plane: float32, shape as `aovs.shape_of`; `beauty` is premultiplied.
         color_correction: applied to colours; data is never corrected.
 
     Returns:
@@ -266,7 +227,7 @@ def _corrected(rgb: F32, color_correction: str) -> F32:
         return srgb_encode(np.clip(rgb, 0.0, 1.0))
     import OpenImageIO as oiio
 
-    shown = oiio.ImageBufAlgo.ociodisplay(oiio.ImageBuf(rgb), "", "", _LINEAR_REC709)
+    shown = oiio.ImageBufAlgo.ociodisplay(oiio.ImageBuf(rgb), "", "", "lin_rec709_scene")
     if shown.has_error:
         raise UsageError(
             f"color correction mode openColorIO: {reason(shown.geterror())}; "

@@ -12,7 +12,6 @@ from ..kernels.lanes import by_address
 from ..scene import F32
 from .measure import F64, Index, Places
 
-SIZES = (16, 8192)
 TILES = 4.0
 """A uv further than so many tiles from 0 .. 1 is taken for garbage."""
 OVERLAP = 0.03

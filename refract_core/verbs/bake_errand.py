@@ -35,7 +35,7 @@ def bake_one(bench: Bench, errand: Errand) -> tuple[bytes, float]:
     Returns:
         The texture's file, and the seconds it took.
     """
-    from ..images.pictures import write_cubemap
+    from ..images.cubemaps import write_cubemap
     from ..rendering.session import capture_probes
 
     started = time.perf_counter()

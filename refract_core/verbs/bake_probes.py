@@ -262,7 +262,7 @@ def _kept(order: BakeOrder, task: Task, before: Baked | None, own: str) -> Baked
 
 def _notes_of(path: str) -> Mapping[str, Any] | None:
     """What is written in a texture about its making; None where there is no file, {} where it cannot be read."""
-    from ..images.pictures import read_notes
+    from ..images.cubemaps import read_notes
     from ..usd.probes.bakes import read_asset
 
     source = read_asset(path)
@@ -292,7 +292,7 @@ def _baked(
     capture: Capture | None,
 ) -> Iterator[tuple[Task, Baked]]:
     """Capture and write, a few probes at a time."""
-    from ..images.pictures import write_cubemap
+    from ..images.cubemaps import write_cubemap
 
     done = 0
     for batch in batches(tasks):

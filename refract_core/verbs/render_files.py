@@ -8,11 +8,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import Cancelled, ImageError, UsageError
-from ..files import replacing
+from ..files import write_whole
 from ..progress import Report
 from ..scene import Notice, Scene
 from ..settings import RenderSettings
@@ -38,7 +37,7 @@ class Order:
     overrides: Mapping[str, object] = field(default_factory=dict)
     """Fields of `RenderSettings` that win over what the stage authors."""
     materials: Overrides = field(default_factory=dict)
-    """Values that win over what single materials author, see `refract_core.override`."""
+    """Values that win over what single materials author, see `override`."""
     settings_prim: str = ""
     """RenderSettings prim whose authored values win over the defaults; '' is the one the stage names, if any."""
     aovs: tuple[str, ...] = ()
@@ -204,8 +203,7 @@ def _render_elsewhere(
     results = spread(crew, _picture, shots, sent, stop=partial(_stop_if, cancel), waiting=patience(report))
     for done, (shot, picture) in enumerate(results, 1):
         tell(picture.notices)
-        with replacing(shot.path, ImageError) as temporary:
-            Path(temporary).write_bytes(picture.data)
+        write_whole(shot.path, picture.data, ImageError)
         report.progress(done / len(shots), f"frame {done} of {len(shots)} done")
         _say_done(report, shot, picture.width, picture.height, picture.seconds)
 

@@ -27,7 +27,7 @@ def read_cubemap(path: str, resolution: int) -> Cubemap:
     Raises:
         ImageError: the file is absent, or is no picture that makes a cubemap.
     """
-    from ...images.pictures import read_cubemap as decode
+    from ...images.cubemaps import read_cubemap as decode
 
     return decode(file_of(path), path, resolution)
 

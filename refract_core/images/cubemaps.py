@@ -20,17 +20,15 @@ from typing import Any
 import numpy as np
 
 from ..errors import ImageError, UsageError
-from ..files import replacing
+from ..files import write_whole
 from ..scene import CUBE_LEVELS, F32, Cubemap
 from .layouts import LAYOUTS, arrange, faces_of, halved
-from .codec import HALF_MAX, check_size, extension_of, memory_file, named_file, read_pixels, reason
+from .codec import HALF_MAX, check_size, exr_spec, extension_of, memory_file, named_file, read_pixels, reason
 from .srgb import srgb_decode
 
 CHANNELS = ("R", "G", "B", "A", "Z")
-_FORMATS = ("half", "half", "half", "half", "float")
 _OURS = "refract:"
 _LAYOUT, _RESOLUTION, _LEVELS = f"{_OURS}layout", f"{_OURS}resolution", f"{_OURS}levels"
-_TILE = 64
 
 
 # --- writing -----------------------------------------------------------------------------------------------------
@@ -55,9 +53,7 @@ def write_cubemap(
         raise UsageError(f"{path}: a cubemap is written as .exr; change the extension")
     chain, exact = _mip_chain(cubemap, layout)
     notes = {**(metadata or {}), _LAYOUT: layout, _RESOLUTION: cubemap.resolution, _LEVELS: exact}
-    data = _encoded_levels(path, chain, notes)
-    with replacing(path, ImageError) as temporary:
-        Path(temporary).write_bytes(data)
+    write_whole(path, _encoded_levels(path, chain, notes), ImageError)
 
 
 def _mip_chain(cubemap: Cubemap, layout: str) -> tuple[list[F32], int]:
@@ -98,7 +94,7 @@ def _with_distance(texels: F32) -> F32:
 
 
 def _encoded_levels(path: str, chain: list[F32], metadata: Mapping[str, str | float]) -> bytes:
-    """The whole file in memory, as `image_files.encoded` does it for flat pictures."""
+    """The whole file in memory, as `codec.encoded` does it for flat pictures."""
     import OpenImageIO as oiio
 
     with memory_file() as name:
@@ -122,18 +118,11 @@ def _encoded_levels(path: str, chain: list[F32], metadata: Mapping[str, str | fl
 
 
 def _spec(picture: F32, metadata: Mapping[str, str | float]) -> Any:
-    import OpenImageIO as oiio
-
-    spec = oiio.ImageSpec(picture.shape[1], picture.shape[0], len(CHANNELS), "float")
-    spec.channelnames = CHANNELS
-    spec.channelformats = tuple(oiio.TypeDesc(one) for one in _FORMATS)
-    spec.tile_width = spec.tile_height = _TILE
+    formats = ("half", "half", "half", "half", "float")
+    spec = exr_spec(picture.shape[1], picture.shape[0], CHANNELS, formats, metadata)
+    spec.tile_width = spec.tile_height = 64
     spec.tile_depth = 1
-    spec.attribute("compression", "zip")
-    spec.attribute("DateTime", "")  # else the writer stamps the time, and equal cubemaps make unequal files
     spec.attribute("textureformat", "Plain Texture")  # what makes the writer keep MIP levels
-    for key, value in metadata.items():
-        spec.attribute(key, value)
     return spec
 
 
