@@ -66,7 +66,7 @@ def checked(paths: list[str], root: str) -> list[str]:
 
 
 def _look(root: str, stage: str, layers: int, unpacked_bytes: int) -> dict[str, Any]:
-    from refract_core.usd.layers.sending import files_of as all_files_of
+    from refract_core.usd.layers.assets import files_of as all_files_of
 
     from . import precheck
 

@@ -11,8 +11,8 @@ import OpenImageIO as oiio
 import pytest
 
 from refract_core.errors import ImageError, UsageError
-from refract_core.images.layouts import LAYOUTS, arrange, face_directions, faces_of, halved, latlong_directions
 from refract_core.images.cubemaps import read_cubemap, write_cubemap
+from refract_core.images.layouts import LAYOUTS, arrange, face_directions, faces_of, halved, latlong_directions
 from refract_core.scene import CUBE_LEVELS, F32, F64, Cubemap
 
 AXES = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))

@@ -22,8 +22,8 @@ import numpy as np
 from ..errors import ImageError, UsageError
 from ..files import write_whole
 from ..scene import CUBE_LEVELS, F32, Cubemap
-from .layouts import LAYOUTS, arrange, faces_of, halved
 from .codec import HALF_MAX, check_size, exr_spec, extension_of, memory_file, named_file, read_pixels, reason
+from .layouts import LAYOUTS, arrange, faces_of, halved
 from .srgb import srgb_decode
 
 CHANNELS = ("R", "G", "B", "A", "Z")

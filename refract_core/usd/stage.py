@@ -5,29 +5,29 @@ from __future__ import annotations
 import math
 import os
 import zipfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Sdf, Tf, Usd, UsdGeom, UsdLux, UsdUtils
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdLux
 
 from ..errors import StageError, UsageError
 from ..scene import F64, Mesh, Notice, Scene, Sphere
 from .camera import choose_camera, read_cameras
+from .diagnostics import captured, words_of
 from .geometry.parts import Bound, Part, Tables, assemble, bind
 from .geometry.place import Placed, bounds_of, place, to_mesh, to_sphere
 from .geometry.shapes import Shape, read_shape
 from .geometry.skel import posed
 from .geometry.traverse import Placement, some_of, walk
-from .layers.edit import words_of
 from .lights.read import read_lights
 from .ours import recognised
 from .probes.pictures import read_cubemap
 from .probes.read import read_probes
 from .registering import register
+from .values import triple
 
 Keep = Callable[[list[Placement], Tables], list[Placement]]
 """Some of what is drawn."""
@@ -129,17 +129,6 @@ def scene_from_stage(
     return replace(scene, notices=tuple(dict.fromkeys(notices)))
 
 
-@contextmanager
-def captured() -> Iterator[list[str]]:
-    """Takes USD's warnings away from stderr; they are in the list once the block is left."""
-    delegate = UsdUtils.CoalescingDiagnosticDelegate()
-    heard: list[str] = []
-    try:
-        yield heard
-    finally:
-        heard.extend(words_of(diagnostic) for diagnostic in delegate.TakeUncoalescedDiagnostics())
-
-
 def _composition_notices(stage: Usd.Stage) -> list[Notice]:
     """What composition could not bring together: missing references, payloads, sublayers."""
     root = stage.GetRootLayer().identifier
@@ -176,7 +165,7 @@ def _read(
     meshes, spheres = _drawn(placed, centre)
     engine_from_stage = metres_from_stage.copy()
     engine_from_stage[:3, 3] = -centre
-    bounds = _corner(extent[0] - centre), _corner(extent[1] - centre)
+    bounds = triple(extent[0] - centre), triple(extent[1] - centre)
     frame: dict[str, Any] = {
         "engine_from_stage": engine_from_stage,
         "metres_per_unit": metres_per_unit,
@@ -213,11 +202,6 @@ def _drawn(placed: list[Placed], centre: F64) -> tuple[tuple[Mesh, ...], tuple[S
         else:
             meshes.append(to_mesh(item, centre))
     return tuple(reversed(meshes)), tuple(reversed(spheres))
-
-
-def _corner(point: F64) -> tuple[float, float, float]:
-    x, y, z = point.tolist()
-    return x, y, z
 
 
 def _has_light(stage: Usd.Stage) -> bool:

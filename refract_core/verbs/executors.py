@@ -166,7 +166,7 @@ def sent_stage(path: str, name: str) -> Sent:
         path: of the stage, as a person wrote it.
         name: `Scene.name` of the stage.
     """
-    from ..usd.layers.sending import absolute, files_of
+    from ..usd.layers.assets import absolute, files_of
 
     stage = absolute(path)
     return Sent(secrets.token_hex(8), stage, name, _hashed(files_of(stage)), __version__)
@@ -257,7 +257,7 @@ def _result_of(future: Future[Any]) -> Any:
 
 
 def _packed(sent: Sent) -> bytes:
-    from ..usd.layers.sending import packed
+    from ..usd.layers.write import packed
 
     data = packed(sent.stage)
     if not _is_here(sent):

@@ -6,11 +6,12 @@ import os
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdUtils
+from pxr import Gf, Sdf, Usd, UsdGeom
 
 from ...scene import Notice
-from ..layers.edit import outer_of, words_of
-from ..layers.write import RECORD, overlay
+from ..diagnostics import captured
+from ..layers.assets import outer_of
+from ..layers.write import RECORD, apply_api, overlay
 from ..materials.read import API
 from ..ours import recognised
 from ..stage import open_stage, stage_unit, time_range
@@ -75,9 +76,8 @@ def origin(path: str) -> dict[str, str]:
 
 def _flat(stage: Usd.Stage) -> tuple[Sdf.Layer, list[str]]:
     """One layer with everything, and what USD says about that."""
-    delegate = UsdUtils.CoalescingDiagnosticDelegate()
-    layer = stage.Flatten(addSourceFileComment=False)  # it would name folders of this machine
-    said = [words_of(one) for one in delegate.TakeUncoalescedDiagnostics()]
+    with captured() as said:
+        layer = stage.Flatten(addSourceFileComment=False)  # it would name folders of this machine
     return layer, list(dict.fromkeys(said))
 
 
@@ -98,24 +98,11 @@ def add(layer: Sdf.Layer, additions: Iterable[Addition]) -> None:
         for addition in additions:
             spec = Sdf.CreatePrimInLayer(layer, addition.path)
             if addition.applies:
-                _apply(spec)
+                apply_api(spec, API)
             for name, value in addition.values.items():
                 _attribute(spec, name).default = _typed(name, value)
             for name, source in addition.connections.items():
                 _attribute(spec, name).connectionPathList.explicitItems = [Sdf.Path(source)]
-
-
-def _apply(spec: Sdf.PrimSpec) -> None:
-    """Put the schema in front of those that the spec applies already."""
-    known = spec.GetInfo("apiSchemas") if spec.HasInfo("apiSchemas") else Sdf.TokenListOp()
-    if known.isExplicit:
-        items = Sdf.TokenListOp.CreateExplicit([API, *(name for name in known.explicitItems if name != API)])
-    else:
-        items = Sdf.TokenListOp()
-        items.prependedItems = [API, *(name for name in known.prependedItems if name != API)]
-        items.appendedItems = known.appendedItems
-        items.deletedItems = [name for name in known.deletedItems if name != API]
-    spec.SetInfo("apiSchemas", items)
 
 
 def _attribute(spec: Sdf.PrimSpec, name: str) -> Sdf.AttributeSpec:

@@ -1,3 +1,3 @@
 """Layers: asset paths, packages, thin layers over a stage, and their way to disk."""
 
-__all__ = ["edit", "package", "sending", "write"]
+__all__ = ["assets", "write"]

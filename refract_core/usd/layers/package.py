@@ -16,10 +16,10 @@ import zipfile
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
-from pxr import Ar, Sdf, Tf, UsdUtils
+from pxr import Ar, Sdf, Tf
 
 from ...errors import StageError
-from .edit import asset_paths, copy_of, edit_asset_paths, export, is_expression, outer_of, quiet
+from .assets import anchored, asset_paths, copy_of, dependencies, edit_asset_paths, export, is_expression, outer_of
 
 _LAYERS = (".usd", ".usda", ".usdc")
 _ALIGNMENT = 64
@@ -96,29 +96,25 @@ def _files_of(asset: str) -> set[str]:
         return set()
     if "<UDIM>" in asset:
         return {os.path.abspath(tile) for tile in tiles(asset)}
-    paths = [asset]
-    if outer_of(asset).lower().endswith((*_LAYERS, ".usdz")) and os.path.isfile(outer_of(asset)):
-        with quiet():
-            try:
-                layers, assets, missing = UsdUtils.ComputeAllDependencies(Sdf.AssetPath(asset))
-            except Tf.ErrorException as error:
-                raise StageError(f"{asset}: cannot be packed, for a part of it cannot be read") from error
-        _check_variables(missing)
-        paths += [*(layer.realPath for layer in layers), *assets]
-    files = {os.path.abspath(outer_of(path)) for path in paths if path}
-    return {file for file in files if os.path.isfile(file)}
+    outer = os.path.abspath(outer_of(asset))
+    if not os.path.isfile(outer):
+        return set()
+    if not outer.lower().endswith((*_LAYERS, ".usdz")):
+        return {outer}
+    try:
+        files, missing = dependencies(asset)
+    except Tf.ErrorException as error:
+        raise StageError(f"{asset}: cannot be packed, for a part of it cannot be read") from error
+    for path in missing:
+        if "${" in path:
+            text = f"{os.path.basename(path)}: this asset path has a variable that cannot be resolved before packing"
+            raise StageError(f"{text}; write a .usda or .usdc file instead of a .usdz")
+    return set(files)
 
 
 def tiles(asset: str) -> list[str]:
     """The files of a texture in tiles, whose name says <UDIM> for a number of four digits."""
     return glob.glob(glob.escape(asset).replace("<UDIM>", "[0-9]" * 4)) if "<UDIM>" in asset else []
-
-
-def _check_variables(missing: list[str]) -> None:
-    for path in missing:
-        if "${" in path:
-            text = f"{os.path.basename(path)}: this asset path has a variable that cannot be resolved before packing"
-            raise StageError(f"{text}; write a .usda or .usdc file instead of a .usdz")
 
 
 def _relative(path: str, folder: str) -> str:
@@ -143,9 +139,9 @@ def _ready(file: str, name: str, trees: list[_Tree], scratch: str) -> str:
     folder = os.path.dirname(name)
 
     def kept(asset: str) -> str:
-        if not asset or is_expression(asset) or asset.startswith(("./", "../")):  # the tree keeps its shape
+        if is_expression(asset) or asset.startswith(("./", "../")):  # the tree keeps its shape
             return asset
-        return _named(str(Sdf.ComputeAssetPathRelativeToLayer(layer, asset)), trees, folder)
+        return _named(anchored(asset, layer), trees, folder)
 
     if layer is None or all(kept(asset) == asset for asset in asset_paths(layer)):
         return file

@@ -1,16 +1,18 @@
-"""Layers out: a thin layer over a stage, and its way to disk, whole or not at all."""
+"""Layers out: a thin layer over a stage, opinions in it, and its way to disk, whole or not at all."""
 
 from __future__ import annotations
 
 import os
+import tempfile
 from pathlib import Path
 from typing import Any
 
-from pxr import Sdf, Tf, UsdUtils
+from pxr import Sdf, Tf
 
 from ...errors import StageError, UsageError
 from ...files import check_place, replacing
-from .edit import copy_of, edit_asset_paths, export, is_expression, outer_of, quiet
+from ..diagnostics import captured
+from .assets import absolute, anchored, copy_of, edit_asset_paths, export, files_of, is_expression, outer_of
 from .package import pack, tiles
 
 EXTENSIONS = (".usd", ".usda", ".usdc", ".usdz")
@@ -42,27 +44,17 @@ def check_out(stage: str, out: str, *, overwrite: bool, ours: str = "") -> None:
     check_place(out, StageError)
     if not os.path.lexists(out):
         return
-    if _same(outer_of(stage), out) or any(_same(outer_of(part), out) for part in _files_of(stage)):
+    if _same(outer_of(stage), out) or any(_same(part, out) for part in files_of(stage)):
         raise UsageError(f"{out}: the stage {stage} is made of this file, and input is never changed; name another OUT")
     if not overwrite and not is_over(out, stage, made=ours):
         raise UsageError(f"{out}: exists already; choose another name, or replace it with --overwrite")
-
-
-def _files_of(stage: str) -> list[str]:
-    """Every layer and package the stage is composed of, with all its variants."""
-    with quiet():
-        try:
-            layers, _, _ = UsdUtils.ComputeAllDependencies(Sdf.AssetPath(stage))
-        except Tf.ErrorException:  # a damaged part; opening the stage tells about it
-            return []
-    return [str(layer.realPath or layer.identifier) for layer in layers]
 
 
 def is_over(out: str, stage: str, *, made: str) -> bool:
     """`out` is a layer over `stage` that `made` made."""
     if not made or not os.path.isfile(out):
         return False
-    with quiet():
+    with captured():
         try:
             layer = Sdf.Layer.OpenAsAnonymous(out, metadataOnly=True)
         except Tf.ErrorException:
@@ -100,8 +92,8 @@ def overlay(stage: str, *, made: str) -> Sdf.Layer:
     Raises:
         StageError: the stage's root layer cannot be read.
     """
-    path = _absolute(stage)
-    with quiet():
+    path = absolute(stage)
+    with captured():
         try:
             below = Sdf.Layer.FindOrOpen(path)
         except Tf.ErrorException:
@@ -116,20 +108,22 @@ def overlay(stage: str, *, made: str) -> Sdf.Layer:
         if key not in _STAYS_BELOW:
             layer.pseudoRoot.SetInfo(key, below.pseudoRoot.GetInfo(key))
     # The metadata's asset paths are relative to the stage, and the new layer will lie elsewhere.
-    edit_asset_paths(layer, lambda asset: asset if asset == path else _anchored(asset, below))
+    edit_asset_paths(layer, lambda asset: asset if asset == path else anchored(asset, below))
     layer.customLayerData = {**layer.customLayerData, RECORD: {"made": made, "stage": path}}
     return layer
 
 
-def _absolute(path: str) -> str:
-    outer = outer_of(path)
-    return os.path.abspath(outer) + path[len(outer) :]
-
-
-def _anchored(asset: str, layer: Sdf.Layer) -> str:
-    if not asset or is_expression(asset):
-        return asset
-    return str(Sdf.ComputeAssetPathRelativeToLayer(layer, asset))
+def apply_api(spec: Sdf.PrimSpec, name: str) -> None:
+    """Put an API schema in front of those that a spec applies already."""
+    known = spec.GetInfo("apiSchemas") if spec.HasInfo("apiSchemas") else Sdf.TokenListOp()
+    if known.isExplicit:
+        items = Sdf.TokenListOp.CreateExplicit([name, *(one for one in known.explicitItems if one != name)])
+    else:
+        items = Sdf.TokenListOp()
+        items.prependedItems = [name, *(one for one in known.prependedItems if one != name)]
+        items.appendedItems = known.appendedItems
+        items.deletedItems = [one for one in known.deletedItems if one != name]
+    spec.SetInfo("apiSchemas", items)
 
 
 # --- the file ----------------------------------------------------------------------------------------------------
@@ -160,6 +154,16 @@ def save(layer: Sdf.Layer, out: str) -> None:
         else:
             edit_asset_paths(written, lambda asset: _relative(asset, out))
             export(written, temporary, out)
+
+
+def packed(stage: str) -> bytes:
+    """A .usdz with everything in it that a stage is made of, to be sent. Raises StageError where that cannot be."""
+    if stage.lower().endswith(".usdz"):
+        return Path(stage).read_bytes()
+    with tempfile.TemporaryDirectory(prefix="refract-send-") as folder:
+        file = os.path.join(folder, "stage.usdz")
+        save(overlay(stage, made="send"), file)
+        return Path(file).read_bytes()
 
 
 def _joined(folder: str, asset: str) -> str:

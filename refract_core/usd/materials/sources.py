@@ -11,7 +11,8 @@ from pxr import Usd, UsdShade
 
 from ...errors import ImageError
 from ...scene import Channel, Notice, Source, Texture, Wrap
-from .textures import COLOR_SPACES, finite, numbers, read_texture, resolve_asset, texture_key
+from ..values import finite, numbers
+from .textures import COLOR_SPACES, read_texture, resolve_asset, texture_key
 
 Value = float | tuple[float, float, float]
 """A scalar, or a colour or vector of three."""
@@ -236,7 +237,7 @@ def _wrap(context: Context, shader: UsdShade.Shader, name: str, default: str, kn
 def _fallback(context: Context, shader: UsdShade.Shader, default: tuple[float, ...]) -> Four:
     """The node's fallback, filled up to four: nodes and files differ in how many numbers they give."""
     found = numbers(read_constant(context, shader.GetInput("fallback") or shader.GetInput("default"), default))
-    if found is None or not finite(found):
+    if not found or not finite(found):
         note(context, f"inputs:fallback is {found}; finite numbers are needed, {shown(default)} is used",
              shader.GetPath())  # fmt: skip
         found = default

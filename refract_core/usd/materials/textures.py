@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
-from typing import Any
 
 from pxr import Ar, Sdf, Usd
 
@@ -73,20 +71,3 @@ def file_of(path: str) -> str | bytes:
         name = Path(package).name
         raise ImageError(f"{path}: {name} holds no file '{inner}'; look into it with `usdzip -l {name}`")
     return bytes(asset.GetBuffer())
-
-
-def numbers(value: Any) -> tuple[float, ...] | None:
-    """A USD value as floats: a number gives one, a vector or colour its components, anything else None."""
-    if isinstance(value, bool | int | float):
-        return (float(value),)
-    if isinstance(value, str) or value is None:
-        return None
-    try:
-        found = tuple(float(part) for part in value)
-    except (TypeError, ValueError):
-        return None
-    return found if found else None
-
-
-def finite(values: tuple[float, ...]) -> bool:
-    return all(math.isfinite(value) for value in values)

@@ -14,9 +14,10 @@ from pxr import Usd, UsdGeom
 from ...scene import F64, Notice, Probe, Volume
 from ..ours import PROBE as API
 from ..ours import applied, collection
+from ..values import triple
+from .attributes import INF, ProbePrim, fallback, flag, floats, forced, positive, token
 from .pictures import ReadCubemap, picture_of, refuse_picture
-from .values import INF, ProbePrim, fallback, flag, forced, numbers, positive, token
-from .volumes import Frame, Place, frame_of, own_volume, proxy_of, triple
+from .volumes import Frame, Place, frame_of, own_volume, proxy_of
 
 PLANAR = "RefractPlanarProbe"
 MODES = ("baked", "realtime", "custom")
@@ -102,7 +103,7 @@ def _read_probe(source: ProbePrim, place: Place, frame: Frame) -> Probe:
     influence = own_volume(source, place, frame, "influence", sphere)
 
     def number(name: str, high: float = INF) -> float:
-        return numbers(source, f"probe:{name}", (0.0,), (high,))[0]
+        return floats(source, f"probe:{name}", (0.0,), (high,))[0]
 
     return Probe(
         path=source.path,
@@ -110,7 +111,7 @@ def _read_probe(source: ProbePrim, place: Place, frame: Frame) -> Probe:
         capture_point=_capture_point(source, frame, unit, planar),
         influence=influence,
         proxy=proxy_of(source, place, frame, influence),
-        resolution=int(numbers(source, "probe:resolution", RESOLUTION[:1], RESOLUTION[1:])[0]),
+        resolution=int(floats(source, "probe:resolution", RESOLUTION[:1], RESOLUTION[1:])[0]),
         clipping=_clipping(source, unit),
         planar=planar,
         background=_background(source),
@@ -140,7 +141,7 @@ def _edges(source: ProbePrim, frame: Frame, unit: float, influence: Volume, plan
         reach[1:] = [INF] * 5
 
     def faces(name: str, high: Sequence[float]) -> tuple[float, ...]:
-        return frame.per_face(numbers(source, f"probe:influence:{name}", (0.0,) * 6, high))
+        return frame.per_face(floats(source, f"probe:influence:{name}", (0.0,) * 6, high))
 
     blend = tuple(unit * value for value in faces("blendDistance", reach))
     if planar:
@@ -158,7 +159,7 @@ def _capture_point(source: ProbePrim, frame: Frame, unit: float, planar: bool) -
     if planar:
         offset = forced(source, name, (0.0,) * 3, "a planar probe's pictures are taken from the eye")
     else:
-        offset = numbers(source, name, (-INF,) * 3, (INF,) * 3)
+        offset = floats(source, name, (-INF,) * 3, (INF,) * 3)
     return triple(frame.origin + frame.axes @ np.array(offset) * unit)
 
 
@@ -172,7 +173,7 @@ def _clipping(source: ProbePrim, unit: float) -> tuple[float, float]:
 
 
 def _background(source: ProbePrim) -> tuple[float, float, float] | None:
-    colour = numbers(source, "probe:backgroundColor", (0.0,) * 3, (INF,) * 3)
+    colour = floats(source, "probe:backgroundColor", (0.0,) * 3, (INF,) * 3)
     if token(source, "probe:clear", ("sky", "color")) == "sky":
         return None
     red, green, blue = colour

@@ -9,7 +9,8 @@ import numpy as np
 from pxr import UsdGeom
 
 from ...scene import F64, Volume
-from .values import ProbePrim, positive, token
+from ..values import triple
+from .attributes import ProbePrim, positive, token
 
 MIN_EXTENT = 1e-4
 """[m]; the thinnest proxy box, as HDRP's."""
@@ -120,8 +121,3 @@ def _matrix(axes: F64, origin: F64) -> F64:
     matrix[:3, :3] = axes
     matrix[:3, 3] = origin
     return matrix
-
-
-def triple(vector: F64) -> tuple[float, float, float]:
-    x, y, z = (float(part) for part in vector)
-    return x, y, z

@@ -9,8 +9,8 @@ from pxr import Tf, Usd, UsdGeom
 
 from ...errors import StageError
 from ...scene import Notice, Scene
-from ..layers.edit import words_of
-from ..stage import captured, scene_from_stage
+from ..diagnostics import captured, words_of
+from ..stage import scene_from_stage
 from .glass import FLAT_SPHERE, INSIDE_OUT, NO_UV, OPEN, SIZE, TRACED_OPEN, UNITS, glass_findings, glass_of
 from .probes import INSIDE, MISSING, OUTSIDE, STALE, UNBAKED, SceneAt, probe_findings
 from .values import (

@@ -10,19 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
-from ..scene import F64, U32, Material, Model, Notice, Param, Texture
-from ..settings import PURPOSES
-from .convert.find import editable, find_glass, original
-from .geometry.parts import Bound, bind
-from .geometry.place import uniform_scale
-from .geometry.primvars import Corners, Topology, read_primvar, spread
-from .geometry.shapes import Shape, read_shape
-from .geometry.skel import posed
-from .geometry.traverse import Placement, walk
-from .geometry.triangulate import turned_over, weld
-from .materials.read import THICKNESS_PRIMVAR, has_api, read_material
-from .ours import recognised
-from .stage import stage_unit, time_range
+from ...scene import F64, U32, Material, Model, Notice, Param, Texture
+from ...settings import PURPOSES
+from ..convert.find import editable, find_glass, original
+from ..geometry.parts import Bound, bind
+from ..geometry.place import uniform_scale
+from ..geometry.primvars import Corners, Topology, read_primvar, spread
+from ..geometry.shapes import Shape, read_shape
+from ..geometry.skel import posed
+from ..geometry.traverse import Placement, walk
+from ..geometry.triangulate import turned_over, weld
+from ..materials.read import THICKNESS_PRIMVAR, has_api, read_material
+from ..ours import recognised
+from ..stage import stage_unit, time_range
 
 SAME_SIZE = 1.0e-3
 """Relative difference up to which two placements have one size."""

@@ -12,6 +12,7 @@ from pxr import Usd
 from ...errors import StageError
 from ...scene import Notice
 from .. import ours
+from ..values import finite, listed, numbers
 
 INF = math.inf
 
@@ -38,17 +39,10 @@ class ProbePrim:
 
 def fallback(probe: ProbePrim, name: str) -> tuple[float, ...]:
     """What the schema says where nothing is authored."""
-    return floats(ours.fallback(probe.prim, name)) or ()
+    return numbers(ours.fallback(probe.prim, name)) or ()
 
 
-def floats(value: Any) -> tuple[float, ...] | None:
-    try:
-        return tuple(float(part) for part in value) if hasattr(value, "__len__") else (float(value),)
-    except (TypeError, ValueError):
-        return None
-
-
-def numbers(
+def floats(
     probe: ProbePrim, name: str, low: Sequence[float], high: Sequence[float], *, above: bool = False
 ) -> tuple[float, ...]:
     """Value of an attribute in the schema's units, brought into its range.
@@ -59,17 +53,17 @@ def numbers(
         above: `low` itself is out of range
     """
     value = probe.get(name)
-    found = fallback(probe, name) if value is None else floats(value)
+    found = fallback(probe, name) if value is None else numbers(value)
     limits = list(zip(low, high, strict=True))
     used = _within(found, limits, above) or fallback(probe, name)
     if used != found:
-        probe.say(f"{name} is {value}; it must be {_range_text(limits, above)}; {_text(used)} is used")
+        probe.say(f"{name} is {value}; it must be {_rangelisted(limits, above)}; {listed(used)} is used")
     return used
 
 
 def positive(probe: ProbePrim, name: str, count: int) -> tuple[float, ...]:
     """As many finite numbers above 0."""
-    return numbers(probe, name, (0.0,) * count, (INF,) * count, above=True)
+    return floats(probe, name, (0.0,) * count, (INF,) * count, above=True)
 
 
 def token(probe: ProbePrim, name: str, allowed: tuple[str, ...]) -> str:
@@ -97,8 +91,8 @@ def flag(probe: ProbePrim, name: str) -> bool:
 def forced(probe: ProbePrim, name: str, used: tuple[float, ...], reason: str) -> tuple[float, ...]:
     """What is used whatever the author says; a notice where that is something else."""
     value = probe.get(name)
-    if value is not None and floats(value) != used:
-        probe.say(f"{name} is {value}, which is ignored: {reason}; {_text(used)} is used. Remove it")
+    if value is not None and numbers(value) != used:
+        probe.say(f"{name} is {value}, which is ignored: {reason}; {listed(used)} is used. Remove it")
     return used
 
 
@@ -106,7 +100,7 @@ def _within(
     found: tuple[float, ...] | None, limits: list[tuple[float, float]], above: bool
 ) -> tuple[float, ...] | None:
     """The numbers, clamped to their limits; None where that gives nothing sensible."""
-    if found is None or len(found) != len(limits) or not all(map(math.isfinite, found)):
+    if found is None or len(found) != len(limits) or not finite(found):
         return None
     pairs = [(number, *limit) for number, limit in zip(found, limits, strict=True)]
     if above and any(number <= low for number, low, _ in pairs):
@@ -114,7 +108,7 @@ def _within(
     return tuple(min(max(number, low), high) for number, low, high in pairs)
 
 
-def _range_text(limits: list[tuple[float, float]], above: bool) -> str:
+def _rangelisted(limits: list[tuple[float, float]], above: bool) -> str:
     count = {1: "a number", 2: "two numbers", 3: "three numbers", 6: "six numbers"}[len(limits)]
     low, high = limits[0][0], [most for _, most in limits]
     if above:
@@ -123,9 +117,4 @@ def _range_text(limits: list[tuple[float, float]], above: bool) -> str:
         return f"{count}, all finite"
     if len(set(high)) == 1:
         return f"{count} of {low:g} or more" if math.isinf(high[0]) else f"{count} between {low:g} and {high[0]:g}"
-    return f"{count} between {low:g} and {_text(high)}"
-
-
-def _text(found: Sequence[float]) -> str:
-    listed = ", ".join(f"{number:g}" for number in found)
-    return listed if len(found) == 1 else f"({listed})"
+    return f"{count} between {low:g} and {listed(high)}"

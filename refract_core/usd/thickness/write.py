@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
-from ..scene import F64, Notice
-from .materials.read import THICKNESS_PRIMVAR
-from .thickness_find import Body, Coat
+from ...scene import F64, Notice
+from ..layers.write import apply_api
+from ..materials.read import THICKNESS_PRIMVAR
+from .find import Body, Coat
 
 MADE = "bake thickness"
 INPUT = "inputs:refraction:thickness"
@@ -156,9 +157,7 @@ def _specialize(layer: Sdf.Layer, path: str, base: str) -> None:
 def _bind(layer: Sdf.Layer, coat: Coat, material: str, *, has_api: bool) -> None:
     spec = Sdf.CreatePrimInLayer(layer, coat.bound)
     if not has_api:
-        schemas = spec.GetInfo("apiSchemas") if spec.HasInfo("apiSchemas") else Sdf.TokenListOp()
-        schemas.prependedItems = ["MaterialBindingAPI", *schemas.prependedItems]
-        spec.SetInfo("apiSchemas", schemas)
+        apply_api(spec, "MaterialBindingAPI")
     relationship = spec.relationships.get(coat.binding) or Sdf.RelationshipSpec(spec, coat.binding, custom=False)
     relationship.targetPathList.explicitItems = [Sdf.Path(material)]
 

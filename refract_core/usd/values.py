@@ -1,0 +1,37 @@
+"""A value as USD gives it, as plain numbers; and a number as it is written into a stage or told to a person."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+
+def numbers(value: Any) -> tuple[float, ...] | None:
+    """A number gives one, a vector, colour or array its components, anything else (a text, nothing) None."""
+    if isinstance(value, str):
+        return None
+    try:
+        return tuple(float(part) for part in value) if hasattr(value, "__len__") else (float(value),)
+    except (TypeError, ValueError):
+        return None
+
+
+def finite(values: Iterable[float]) -> bool:
+    return all(math.isfinite(value) for value in values)
+
+
+def triple(vector: Iterable[Any]) -> tuple[float, float, float]:
+    x, y, z = (float(part) for part in vector)
+    return x, y, z
+
+
+def listed(values: Iterable[float]) -> str:
+    """As a message shows them: `2`, or `(1, 2, 3)`."""
+    words = [f"{value:g}" for value in values]
+    return words[0] if len(words) == 1 else f"({', '.join(words)})"
+
+
+def neat(value: float) -> float:
+    """Six digits: what float32 holds, and a person can read."""
+    return float(f"{value:.6g}")
