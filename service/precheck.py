@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from pxr import Ar, Sdf, Tf, UsdUtils
 
-from refract_core.usd.stage import captured
+from refract_core.usd.diagnostics import captured
 
 _LAYERS = (".usd", ".usda", ".usdc", ".usdz")
 

@@ -68,7 +68,7 @@ def _warm() -> int:
     """Load everything. Returns the number of threads there are then; above 1, a fork would not be safe."""
     cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(cores)})  # Embree starts a thread for every further core it sees
-    import refract_core.usd.rules.look
+    import refract_core.usd.rules.overview
     import refract_core.usd.rules.stage
     import refract_core.usd.stage
     import refract_core.verbs.convert

@@ -13,13 +13,12 @@ from typer.testing import CliRunner
 
 from refract_core.cli import app
 from refract_core.errors import Cancelled, ImageError, StageError
-from refract_core.images.bake_files import Task, batches
 from refract_core.images.cubemaps import read_notes
-from refract_core.probes.digest import probe_digest
+from refract_core.probes.digest import probe_digest, stale_bakes
 from refract_core.scene import Bake, Scene
 from refract_core.usd.stage import load_stage
 from refract_core.verbs import bake_probes as bake
-from refract_core.verbs.bake_probes import stale_bakes
+from refract_core.verbs.bake_probes import Task, batches
 from refract_core.version import __version__
 
 
@@ -32,7 +31,7 @@ def studio(tmp_path: Path) -> Studio:
 
 
 def test_cancel_leaves_out_as_it_was_and_the_next_run_goes_on(studio: Studio, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("refract_core.images.bake_files._BATCH", 1)
+    monkeypatch.setattr("refract_core.verbs.bake_probes._BATCH", 1)
 
     def stop() -> None:
         studio.cancelled = len(studio.captured) == 1
@@ -96,7 +95,7 @@ def run(*words: object) -> Any:
 
 
 def test_the_command_bakes(studio: Studio, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bake, "_engine", lambda: studio.capture)
+    monkeypatch.setattr(bake, "capture_probes", studio.capture)
     ended = run(studio.stage, studio.out(), "--only", LEFT, "--resolution", 8, "--samples", 2, "--progress", "json")
     assert ended.exit_code == 0, ended.output
     assert '"path": "/World/Left"' in ended.stderr

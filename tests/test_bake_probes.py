@@ -12,13 +12,13 @@ from bake_studio import LEFT, RIGHT, STAGE, Studio, grey, probe_of, studio_in
 from pxr import Sdf
 
 from refract_core.errors import UsageError
-from refract_core.images.bake_files import file_names
 from refract_core.images.cubemaps import read_cubemap, read_notes
-from refract_core.probes.digest import probe_digest
+from refract_core.probes.digest import probe_digest, stale_bake
 from refract_core.scene import CUBE_LEVELS
 from refract_core.usd.stage import load_stage
 from refract_core.verbs import bake_probes as bake
-from refract_core.verbs.bake_probes import BakeOrder, bake_probes, stale_bake
+from refract_core.verbs.bake_probes import BakeOrder, bake_probes
+from refract_core.verbs.orders import file_names
 from refract_core.version import __version__
 
 
@@ -160,6 +160,7 @@ def test_a_changed_scene_is_stale_and_baked_again(studio: Studio, extension: str
 def test_another_version_is_stale_and_baked_again(studio: Studio, monkeypatch: pytest.MonkeyPatch) -> None:
     studio.bake()
     monkeypatch.setattr(bake, "__version__", "99.0")
+    monkeypatch.setattr("refract_core.probes.digest.__version__", "99.0")
     notice = stale_bake(load_stage(studio.out()), probe_of(studio.out(), LEFT))
     assert notice is not None
     assert f"refract {__version__} baked it, this is 99.0" in notice.text

@@ -255,7 +255,7 @@ def test_only_some_and_the_input_is_never_changed(two: Path, tmp_path: Path) -> 
     before = two.read_bytes()
     assert list(run(two, tmp_path / "out.usda", only=("/W/Set",))[0]) == ["A"]
     assert list(run(two, tmp_path / "out.usda", only=("*B", "/W/Set/*"))[0]) == ["A", "B"]
-    with pytest.raises(UsageError, match=r"--only /W/C: no glass is there; the stage has /W/Set/A, /W/B"):
+    with pytest.raises(UsageError, match=r"--only /W/C: the stage has no such glass; it has /W/Set/A, /W/B"):
         run(two, tmp_path / "out.usda", only=("/W/C",))
     assert two.read_bytes() == before
 
@@ -327,7 +327,7 @@ def test_the_command(two: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     again = ["bake", "thickness", str(two), str(out), "--along", "sideways"]
     assert CliRunner().invoke(app, again).exit_code == 2
     orders: list[ThicknessOrder] = []
-    module = importlib.import_module("refract_core.cli.bake_thickness")
+    module = importlib.import_module("refract_core.verbs.bake_thickness")
     monkeypatch.setattr(module, "bake_thickness", lambda order, _report, _cancel: orders.append(order))
     words = ["--only", "/A,/B", "--along", "refracted", "--texture", "64", "--jobs", "1", "--overwrite"]
     assert CliRunner().invoke(app, ["bake", "thickness", "a.usda", "b.usda", *words]).exit_code == 0

@@ -12,8 +12,7 @@ from test_thickness import Solid, box
 
 from refract_core.progress import Report
 from refract_core.scene import Material, Mesh, Param, Scene
-from refract_core.verbs.bake_thickness import ThicknessOrder, bake_thickness
-from refract_core.verbs.measure_thickness import Row
+from refract_core.verbs.bake_thickness import Row, ThicknessOrder, bake_thickness
 
 NAME = "refraction:thickness"
 F64 = NDArray[np.float64]

@@ -1,4 +1,7 @@
-"""The `refract` command: words to calls, no logic. One module per command."""
+"""The `refract` command: words to calls, no logic. One module per command (a group of commands is one).
+
+A module loads its verb when its command runs, so that `refract --help` waits for neither USD nor the kernels.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,6 @@ import sys
 
 from . import (  # noqa: F401  a command is known once its module is loaded
     bake,
-    bake_thickness,
     convert,
     inspect,
     node,

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -35,6 +35,9 @@ def _print_version(wanted: bool) -> None:
 Version = Annotated[
     bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
 ]
+StagePath = Annotated[
+    str, typer.Argument(metavar="STAGE", help="The .usd, .usda, .usdc or .usdz file. It is not changed.")
+]
 Jobs = Annotated[int | None, typer.Option(help="Threads to use; 0, the default, means all cores.")]
 ProgressMode = Annotated[
     str,
@@ -44,6 +47,12 @@ ProgressMode = Annotated[
         help="How progress is told on stderr: auto is a bar on a terminal, json is one object per line.",
     ),
 ]
+
+
+def only_option(what: str) -> Any:
+    """`--only`, which verbs understand alike (`verbs.orders.select`)."""
+    help_text = f"Only these {what}, or those below these paths; * and ? stand for any characters."
+    return typer.Option(metavar="PATH,...", help=help_text)
 
 
 @app.callback()

@@ -1,4 +1,4 @@
-"""`refract bake`."""
+"""`refract bake probes` and `refract bake thickness`."""
 
 from __future__ import annotations
 
@@ -6,15 +6,19 @@ from typing import Annotated
 
 import typer
 
-from ..verbs.bake_probes import BakeOrder, bake_probes
 from ..verbs.executors import crew_at
-from .app import Jobs, ProgressMode, app, outcome, words
+from .app import Jobs, ProgressMode, StagePath, app, only_option, outcome, words
 
 bake = typer.Typer(help="Work something out once and keep it in a layer over the stage.", no_args_is_help=True)
 app.add_typer(bake, name="bake", rich_help_panel=None)
 
-Stage = Annotated[str, typer.Argument(metavar="STAGE", help="The .usd, .usda, .usdc or .usdz file. It is not changed.")]
-Out = Annotated[
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace OUT even if it is not an earlier bake of the same stage.")
+]
+
+# --- probes ---------------------------------------------------------------------------------------------------------
+
+ProbesOut = Annotated[
     str,
     typer.Argument(
         metavar="OUT",
@@ -22,12 +26,7 @@ Out = Annotated[
         "extension), or into OUT itself where that is a .usdz.",
     ),
 ]
-Only = Annotated[
-    str,
-    typer.Option(
-        metavar="PATH,...", help="Only these probes, or those below these paths; * and ? stand for any characters."
-    ),
-]
+Probes = Annotated[str, only_option("probes")]
 Resolution = Annotated[
     int | None, typer.Option(help="Texels on a side of each face, 8 to 4096, instead of each probe's own.")
 ]
@@ -47,16 +46,13 @@ Force = Annotated[bool, typer.Option("--force", help="Bake all, also what is up 
 SkipExisting = Annotated[
     bool, typer.Option("--skip-existing", help="Leave textures that exist as they are, up to date or not.")
 ]
-Overwrite = Annotated[
-    bool, typer.Option("--overwrite", help="Replace OUT even if it is not an earlier bake of the same stage.")
-]
 
 
 @bake.command("probes")
 def bake_probes_command(
-    stage: Stage,
-    out: Out,
-    only: Only = "",
+    stage: StagePath,
+    out: ProbesOut,
+    only: Probes = "",
     resolution: Resolution = None,
     layout: Layout = "strip",
     samples: Samples = 16,
@@ -73,6 +69,8 @@ def bake_probes_command(
     kept: the scene it shows, its settings and the version of refract are the same. Run again after a change, or to go
     on after an interruption.
     """
+    from ..verbs.bake_probes import BakeOrder, bake_probes
+
     order = BakeOrder(
         stage=stage,
         out=out,
@@ -87,3 +85,56 @@ def bake_probes_command(
     )
     with outcome(progress) as (report, cancel), crew_at(executor) as crew:
         bake_probes(order, report, cancel, crew=crew)
+
+
+# --- thickness ------------------------------------------------------------------------------------------------------
+
+ThicknessOut = Annotated[
+    str,
+    typer.Argument(
+        metavar="OUT",
+        help="The layer over STAGE to write. Pictures go into the folder OUT.thickness beside it (OUT without its "
+        "extension), or into OUT itself where that is a .usdz.",
+    ),
+]
+Prims = Annotated[str, only_option("prims")]
+Along = Annotated[
+    str,
+    typer.Option(
+        metavar="normal|refracted",
+        help="What to measure: normal is the way straight in to the far side, as glTF has it; refracted is the "
+        "thickness with which the model's way through comes nearest to the real one, over views from all sides.",
+    ),
+]
+Texture = Annotated[
+    int,
+    typer.Option(
+        metavar="N", help="Write pictures of N x N texels in each object's own uv, 16 to 8192, instead of primvars."
+    ),
+]
+
+
+@bake.command("thickness")
+def bake_thickness_command(
+    stage: StagePath,
+    out: ThicknessOut,
+    only: Prims = "",
+    along: Along = "normal",
+    texture: Texture = 0,
+    overwrite: Overwrite = False,
+    jobs: Jobs = None,
+    progress: ProgressMode = "auto",
+) -> None:
+    """Measure how thick glass is in its own geometry, and write a layer over STAGE that says so.
+
+    The thickness becomes primvars:refraction:thickness of each prim, in scene units, or with --texture a picture in a
+    material of its own. Meshes that are open or not manifold are named and left alone, as is what is drawn in several
+    sizes. Spheres, cubes and the like carry one value.
+    """
+    from ..verbs.bake_thickness import ThicknessOrder, bake_thickness
+
+    with outcome(progress) as (report, cancel):
+        order = ThicknessOrder(
+            stage=stage, out=out, only=words(only), along=along, texture=texture, jobs=jobs or 0, overwrite=overwrite
+        )
+        bake_thickness(order, report, cancel)

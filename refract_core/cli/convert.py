@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ..models import MODELS
-from ..verbs.convert import Converted, ConvertOrder, Row, convert
-from .app import ProgressMode, app, outcome, words
+from .app import ProgressMode, app, only_option, outcome, words
+
+if TYPE_CHECKING:
+    from ..verbs.convert import Converted, ConvertOrder, Row
 
 In = Annotated[
     str,
@@ -33,12 +35,7 @@ ModelName = Annotated[
         "--model", metavar="|".join(MODELS), help="Use this model for all glass, whatever its shape."
     ),
 ]
-Only = Annotated[
-    str,
-    typer.Option(
-        metavar="PATH,...", help="Only these materials, or those below these paths; * and ? stand for any characters."
-    ),
-]
+Only = Annotated[str, only_option("materials")]
 Thickness = Annotated[
     str,
     typer.Option(
@@ -76,6 +73,8 @@ def convert_command(
     The model follows the shape a material is on: a closed convex ball is a sphere, a closed convex box a box, what is
     open or hollow is thin, and everything else is traced. Materials that have RefractMaterialAPI are left alone.
     """
+    from ..verbs.convert import ConvertOrder, convert
+
     with outcome(progress) as (report, cancel):
         order = ConvertOrder(
             stage=stage, out=out, flatten=flatten, model=model, only=words(only), thickness=thickness, to=to,

@@ -6,12 +6,14 @@ import hashlib
 import struct
 import weakref
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene import Environment, Light, Material, Mesh, Param, Probe, Scene, Source, Sphere, Texture
+from ..scene import Environment, Light, Material, Mesh, Notice, Param, Probe, Scene, Source, Sphere, Texture
+from ..version import __version__
 
 _UNSEEN = (Param.THICKNESS, Param.TRANSMITTANCE)  # of what is behind a surface; an opaque one does not ask
 
@@ -52,6 +54,43 @@ def probe_digest(scene: Scene, probe: Probe) -> str:
     if scene.environment is not None:
         total.update(_remembered(scene.environment, _environment))
     return total.hexdigest()
+
+
+def stale_bake(scene: Scene, probe: Probe) -> Notice | None:
+    """Say so where a probe's baked texture does not show what the probe sees now.
+
+    Args:
+        scene: the stage at `probe.bake.time_code`, read with the default purposes.
+        probe: of that scene.
+    """
+    if probe.bake is None:
+        return None
+    if probe.bake.engine != __version__:
+        why = f"refract {probe.bake.engine} baked it, this is {__version__}"
+    elif probe_digest(scene, probe) != probe.bake.digest:
+        why = "what it shows has changed since it was baked"
+    else:
+        return None
+    return Notice(probe.path, f"probe:texture is stale: {why}. Run refract bake probes STAGE OUT again")
+
+
+def stale_bakes(probes: Iterable[Probe], scene_at: Callable[[float], Scene]) -> list[Notice]:
+    """`stale_bake` of every probe that has a bake.
+
+    Args:
+        scene_at: the stage at a time code, read with the default purposes; asked once per time code.
+    """
+    notices: list[Notice | None] = []
+    scenes: dict[float, Scene] = {}
+    for probe in probes:
+        if probe.bake is None:
+            continue
+        when = probe.bake.time_code
+        if when not in scenes:
+            scenes[when] = scene_at(when)
+        then = next((other for other in scenes[when].probes if other.path == probe.path), probe)
+        notices.append(stale_bake(scenes[when], replace(then, bake=probe.bake)))
+    return [notice for notice in notices if notice is not None]
 
 
 def _prim_of(path: str) -> str:

@@ -1,11 +1,9 @@
-"""The only wing that knows USD: stages in, plain arrays out, and layers written over them."""
+"""The only wing that knows USD: stages in, plain arrays out, and layers written over them. Draws nothing."""
 
 __all__ = [
-    "camera",
     "convert",
-    "geometry",
+    "diagnostics",
     "layers",
-    "lights",
     "materials",
     "ours",
     "probes",
@@ -14,6 +12,6 @@ __all__ = [
     "settings",
     "stage",
     "thickness",
-    "thickness_find",
     "time_codes",
+    "values",
 ]

@@ -1,5 +1,5 @@
-"""What a person can ask for, from Python, the command line or HTTP: render files, bake, convert, inspect,
-validate.
+"""What a person can ask for, from Python, the command line or HTTP: render files, bake, convert, inspect, validate.
+Knows neither of the three.
 """
 
 __all__ = [

@@ -2,30 +2,39 @@
 
 from __future__ import annotations
 
-import fnmatch
 import os
+import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
-from ..errors import Cancelled, ImageError, UsageError
-from ..files import replacing
-from ..images.bake_files import Baked, Task, batches, file_names, size_text, texture_folder
+from ..errors import ImageError, StageError, UsageError
+from ..files import folder_beside, write_whole
+from ..images.cubemaps import read_notes, write_cubemap
 from ..images.layouts import LAYOUTS
 from ..probes.digest import probe_digest
 from ..progress import Report
-from ..scene import Cubemap, Notice, Probe, Scene
+from ..rendering.session import capture_probes
+from ..scene import Cubemap, Probe, Scene
+from ..usd.layers.write import check_out, save
+from ..usd.probes.pictures import MADE, Baked, earlier, instanced, is_packed, layer_of, own_texture, read_asset
+from ..usd.stage import open_stage, scene_from_stage
 from ..version import __version__
-from .bake_errand import Errand, bake_one
-from .executors import Crew, patience, sent_stage, spread
+from .executors import Bench, Crew, file_bytes, patience, sent_stage, spread
+from .orders import JOBS, check_range, file_names, select, size_text, stop_if
 
 RESOLUTION = (8, 4096)
 SAMPLES = (1, 4096)
-_JOBS = (0, 4096)
-_RECORD = ("digest", "engine", "timeCode", "stage", "samples")
+_RECORD = {"digest": str, "engine": str, "timeCode": float, "stage": str, "samples": int}
+"""What OUT and the texture itself keep of a bake."""
+_BATCH = 16
+"""Probes captured together, which share one BVH; their collections must also fit into the masks of one scene."""
+_BATCH_TEXELS = 1 << 21
+"""... and texels on one face of each, together: what is held in memory at once."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,62 +59,19 @@ class BakeOrder:
     overwrite: bool = False
 
 
-class Capture(Protocol):
-    """`refract_core.render.capture_probes`, or what stands in for it."""
+_STATE = "textures that were finished stay, and OUT is as it was"
 
-    def __call__(
-        self,
-        scene: Scene,
-        probes: Sequence[Probe],
-        *,
-        samples: int,
-        jobs: int,
-        progress: Callable[[float, str], None],
-        cancel: Callable[[], bool],
-    ) -> list[Cubemap]: ...
+Capture = Callable[..., list[Cubemap]]
+"""`rendering.session.capture_probes`, or what stands in for it."""
 
 
-# --- is a bake still true?
+class Task(NamedTuple):
+    """A probe to bake."""
 
-
-def stale_bake(scene: Scene, probe: Probe) -> Notice | None:
-    """Say so where a probe's baked texture does not show what the probe sees now.
-
-    Args:
-        scene: the stage at `probe.bake.time_code`, read with the default purposes.
-        probe: of that scene.
-    """
-    if probe.bake is None:
-        return None
-    if probe.bake.engine != __version__:
-        why = f"refract {probe.bake.engine} baked it, this is {__version__}"
-    elif probe_digest(scene, probe) != probe.bake.digest:
-        why = "what it shows has changed since it was baked"
-    else:
-        return None
-    return Notice(probe.path, f"probe:texture is stale: {why}. Run refract bake probes STAGE OUT again")
-
-
-def stale_bakes(probes: Iterable[Probe], scene_at: Callable[[float], Scene]) -> list[Notice]:
-    """`stale_bake` of every probe that has a bake.
-
-    Args:
-        scene_at: the stage at a time code, read with the default purposes; asked once per time code.
-    """
-    notices: list[Notice | None] = []
-    scenes: dict[float, Scene] = {}
-    for probe in probes:
-        if probe.bake is None:
-            continue
-        when = probe.bake.time_code
-        if when not in scenes:
-            scenes[when] = scene_at(when)
-        then = next((other for other in scenes[when].probes if other.path == probe.path), probe)
-        notices.append(stale_bake(scenes[when], replace(then, bake=probe.bake)))
-    return [notice for notice in notices if notice is not None]
-
-
-# --- baking
+    probe: Probe
+    file: str
+    """the texture to write"""
+    digest: str
 
 
 def bake_probes(
@@ -132,10 +98,6 @@ def bake_probes(
     Raises:
         RefractError: whatever goes wrong.
     """
-    from ..usd.layers.write import check_out, save
-    from ..usd.probes.bakes import MADE, layer_of
-    from ..usd.stage import open_stage, scene_from_stage
-
     _check(order)
     check_out(order.stage, order.out, overwrite=order.overwrite, ours=MADE)
     report.progress(0.0, "reading the stage")
@@ -143,7 +105,7 @@ def bake_probes(
     scene = scene_from_stage(stage)
     for notice in scene.notices:
         report.warning(notice.path, notice.text)
-    with texture_folder(order.out) as folder:
+    with _texture_folder(order.out) as folder:
         bakes, tasks = _plan(order, stage, scene, folder, report)
         if crew is None:
             baking = _baked(order, scene, tasks, report, cancel, capture)
@@ -151,7 +113,7 @@ def bake_probes(
             baking = _baked_elsewhere(order, scene, tasks, report, cancel, crew)
         for task, baked in baking:
             bakes[task.probe.path] = baked
-        _stop_if(cancel)
+        stop_if(cancel, _STATE)
         report.progress(1.0, "writing")
         save(layer_of(order.stage, bakes), order.out)
     report.done(order.out, f"{len(bakes)} of {len(scene.probes)} probes have a texture in it, {len(tasks)} baked now")
@@ -161,9 +123,10 @@ def _plan(
     order: BakeOrder, stage: Any, scene: Scene, folder: str, report: Report
 ) -> tuple[dict[str, Baked], list[Task]]:
     """What OUT keeps, by prim path, and what there is to bake. Tells what is left alone, and why."""
-    from ..usd.probes.bakes import earlier, instanced, own_texture, read_asset
-
-    chosen = _chosen(scene, order)
+    chosen = [
+        replace(probe, resolution=order.resolution or probe.resolution)
+        for probe in select(scene.probes, order.only, lambda probe: (probe.path,), "probe")
+    ]
     locked = instanced(stage, [probe.path for probe in scene.probes])
     reasons = {probe.path: _why_not(probe, probe.path in locked) for probe in scene.probes}
     if all(reasons.values()):
@@ -192,32 +155,11 @@ def _check(order: BakeOrder) -> None:
     if order.layout not in LAYOUTS:
         raise UsageError(f"--layout is '{order.layout}', which is not known; choose from {', '.join(LAYOUTS)}")
     if order.resolution is not None:
-        _in_range("--resolution", order.resolution, RESOLUTION)
-    _in_range("--samples", order.samples, SAMPLES)
-    _in_range("--jobs", order.jobs, _JOBS)
+        check_range("--resolution", order.resolution, RESOLUTION)
+    check_range("--samples", order.samples, SAMPLES)
+    check_range("--jobs", order.jobs, JOBS)
     if order.force and order.skip_existing:
         raise UsageError("--force bakes what exists and --skip-existing leaves it; give one of them")
-
-
-def _in_range(name: str, value: int, limits: tuple[int, int]) -> None:
-    if isinstance(value, bool) or not limits[0] <= value <= limits[1]:
-        raise UsageError(f"{name} is {value}; it must be between {limits[0]} and {limits[1]}")
-
-
-def _chosen(scene: Scene, order: BakeOrder) -> list[Probe]:
-    """The probes of the order, at its resolution."""
-    probes = list(scene.probes)
-    if order.only:
-        for pattern in order.only:
-            if not any(_matches(probe.path, pattern) for probe in probes):
-                known = ", ".join(probe.path for probe in probes[:8]) or "none"
-                raise UsageError(f"--only {pattern}: the stage has no such probe; it has {known}")
-        probes = [probe for probe in probes if any(_matches(probe.path, pattern) for pattern in order.only)]
-    return [replace(probe, resolution=order.resolution or probe.resolution) for probe in probes]
-
-
-def _matches(path: str, pattern: str) -> bool:
-    return fnmatch.fnmatchcase(path, pattern) or fnmatch.fnmatchcase(path, f"{pattern.rstrip('/')}/*")
 
 
 def _why_not(probe: Probe, locked: bool) -> str:
@@ -246,8 +188,6 @@ def _kept(order: BakeOrder, task: Task, before: Baked | None, own: str) -> Baked
     Returns:
         Its texture is '' where the stage itself has what is needed.
     """
-    from ..usd.probes.bakes import is_packed
-
     target = task.file
     if before is not None and is_packed(before.texture) and order.out.lower().endswith(".usdz"):
         target = before.texture
@@ -262,9 +202,6 @@ def _kept(order: BakeOrder, task: Task, before: Baked | None, own: str) -> Baked
 
 def _notes_of(path: str) -> Mapping[str, Any] | None:
     """What is written in a texture about its making; None where there is no file, {} where it cannot be read."""
-    from ..images.cubemaps import read_notes
-    from ..usd.probes.bakes import read_asset
-
     source = read_asset(path)
     if source is None:
         return None
@@ -283,6 +220,42 @@ def _is_current(order: BakeOrder, task: Task, notes: Mapping[str, Any]) -> bool:
     )
 
 
+# --- pictures
+
+
+@contextmanager
+def _texture_folder(out: str) -> Iterator[str]:
+    """Where textures are written, tried before the work. Not left behind empty."""
+    with folder_beside(out, "probes") as place:
+        folder = Path(place)
+        try:
+            folder.mkdir(exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                pass
+        except OSError as error:
+            raise StageError(f"{folder}: is not a folder that textures can be written to: {error.strerror}") from error
+        try:
+            yield place
+        finally:
+            if not any(folder.iterdir()):
+                folder.rmdir()
+
+
+def batches(tasks: list[Task]) -> Iterator[list[Task]]:
+    """The tasks, a few at a time."""
+    batch: list[Task] = []
+    texels = 0
+    for task in tasks:
+        more = task.probe.resolution**2
+        if batch and (len(batch) == _BATCH or texels + more > _BATCH_TEXELS):
+            yield batch
+            batch, texels = [], 0
+        batch.append(task)
+        texels += more
+    if batch:
+        yield batch
+
+
 def _baked(
     order: BakeOrder,
     scene: Scene,
@@ -292,23 +265,21 @@ def _baked(
     capture: Capture | None,
 ) -> Iterator[tuple[Task, Baked]]:
     """Capture and write, a few probes at a time."""
-    from ..images.cubemaps import write_cubemap
-
     done = 0
     for batch in batches(tasks):
-        _stop_if(cancel)
+        stop_if(cancel, _STATE)
         started = time.perf_counter()
-        cubemaps = (capture or _engine())(
+        cubemaps = (capture or capture_probes)(
             scene,
             [task.probe for task in batch],
             samples=order.samples,
             jobs=order.jobs,
-            progress=_part(report, done, len(batch), len(tasks)),
+            progress=_batch_progress(report, done, len(batch), len(tasks)),
             cancel=cancel,
         )
         seconds = (time.perf_counter() - started) / len(batch)
         for task, cubemap in zip(batch, cubemaps, strict=True):
-            _stop_if(cancel)
+            stop_if(cancel, _STATE)
             record = _record(order, scene, task)
             write_cubemap(task.file, cubemap, order.layout, _to_notes(record, task.probe))
             _say_baked(report, task, seconds)
@@ -316,10 +287,37 @@ def _baked(
         done += len(batch)
 
 
+def _batch_progress(report: Report, done: int, some: int, count: int) -> Callable[[float, str], None]:
+    """Progress of a few probes as progress of all."""
+    last = f" to {done + some}" if some > 1 else ""
+    text = f"probe {done + 1}{last} of {count}"
+    return lambda fraction, _stage: report.progress((done + fraction * some) / count, text)
+
+
 def _say_baked(report: Report, task: Task, seconds: float) -> None:
     size = size_text(os.path.getsize(task.file))
     text = f"baked: {os.path.basename(task.file)}, {task.probe.resolution}, {size}, {seconds:.1f} s"
     report.done(task.probe.path, text)
+
+
+# --- pictures that others take
+
+
+class Errand(NamedTuple):
+    """What to bake. The same errand over the same stage gives the same bytes, wherever it is done."""
+
+    number: int
+    path: str
+    time_code: float
+    digest: str
+    """`probe_digest` in the process that gives the order"""
+    resolution: int
+    """[texels]"""
+    samples: int
+    jobs: int
+    layout: str
+    notes: Mapping[str, str | float]
+    """attributes of the file"""
 
 
 def _baked_elsewhere(
@@ -333,25 +331,38 @@ def _baked_elsewhere(
         for number, (task, record) in enumerate(zip(tasks, records, strict=True))
     ]  # fmt: skip
     sent = sent_stage(order.stage, scene.name)
-    results = spread(crew, bake_one, errands, sent, stop=partial(_stop_if, cancel), waiting=patience(report))
+    results = spread(crew, _bake_one, errands, sent, stop=partial(stop_if, cancel, _STATE), waiting=patience(report))
     for done, (errand, (data, seconds)) in enumerate(results, 1):
         task = tasks[errand.number]
-        with replacing(task.file, ImageError) as temporary:
-            Path(temporary).write_bytes(data)
+        write_whole(task.file, data, ImageError)
         report.progress(done / len(tasks), f"probe {done} of {len(tasks)} done")
         _say_baked(report, task, seconds)
         yield task, Baked(task.file, records[errand.number], order.resolution)
 
 
-def _engine() -> Capture:
-    from ..rendering.session import capture_probes
+def _bake_one(bench: Bench, errand: Errand) -> tuple[bytes, float]:
+    """Bake a probe on a worker.
 
-    return capture_probes
+    Returns:
+        The texture's file, and the seconds it took.
+    """
+    started = time.perf_counter()
+    scene = bench.read(time_code=errand.time_code)
+    found = [probe for probe in scene.probes if probe.path == errand.path]
+    probe = replace(found[0], resolution=errand.resolution) if found else None
+    if probe is None or probe_digest(scene, probe) != errand.digest:
+        raise StageError(f"{errand.path}: a worker reads the stage differently; is the same usd-core installed there?")
+    (cubemap,) = capture_probes(scene, [probe], samples=errand.samples, jobs=errand.jobs, cancel=bench.cancel)
+    data = file_bytes(lambda path: write_cubemap(path, cubemap, errand.layout, errand.notes), "probe.exr")
+    return data, time.perf_counter() - started
+
+
+# --- what is written about a bake
 
 
 def _record(order: BakeOrder, scene: Scene, task: Task) -> dict[str, Any]:
-    """What the picture was made from, as OUT and the texture itself keep it."""
-    name = os.path.basename(order.stage)
+    """What the picture was made from."""
+    name = os.path.basename(order.stage)  # a folder would say where somebody works
     values = (task.digest, __version__, float(scene.time_code), name, int(order.samples))
     return dict(zip(_RECORD, values, strict=True))
 
@@ -364,20 +375,7 @@ def _to_notes(record: Mapping[str, Any], probe: Probe) -> dict[str, str | float]
 
 def _from_notes(notes: Mapping[str, Any]) -> dict[str, Any]:
     """The record in a texture's notes; empty where it is not all there."""
-    kinds = (str, str, float, str, int)
     try:
-        return {key: kind(notes[key]) for key, kind in zip(_RECORD, kinds, strict=True)}
+        return {key: kind(notes[key]) for key, kind in _RECORD.items()}
     except (KeyError, TypeError, ValueError):
         return {}
-
-
-def _part(report: Report, done: int, some: int, count: int) -> Callable[[float, str], None]:
-    """Progress of a few probes as progress of all."""
-    last = f" to {done + some}" if some > 1 else ""
-    text = f"probe {done + 1}{last} of {count}"
-    return lambda fraction, _stage: report.progress((done + fraction * some) / count, text)
-
-
-def _stop_if(cancel: Callable[[], bool]) -> None:
-    if cancel():
-        raise Cancelled("cancelled; textures that were finished stay, and OUT is as it was")

@@ -6,27 +6,34 @@ thickness. What is measured along a ray is said at the head of `thickness`.
 
 from __future__ import annotations
 
-import fnmatch
 import os
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
-from ..errors import Cancelled, StageError, UsageError
+import numpy as np
+
+from ..errors import UsageError
 from ..files import folder_beside
-from ..images.bake_files import file_names
+from ..images.pictures import write_map
+from ..models import Behind
 from ..progress import Report
-from ..scene import F32, Notice
+from ..scene import F32, F64, Notice
+from ..thickness.measure import Places, corner_places, measure, mended, middle_places, views
+from ..thickness.picture import OVERLAP, TILES, draw, is_tiled
+from ..usd.layers.write import check_out, is_over, overlay, save
+from ..usd.stage import open_stage
+from ..usd.thickness.find import Body, Candidate, Coat, Found, find_candidates, read_body, stage_of
+from ..usd.thickness.write import MADE, Map, Values, lost_bindings, spread_values, write_maps, write_values
 from ..version import __version__
-from .measure_thickness import How, Row, Work, measure_all
-
-if TYPE_CHECKING:
-    from ..usd.thickness_find import Candidate, Found
+from .orders import JOBS, check_range, file_names, make_folder_of, refuse_existing, select, stop_if
 
 ALONG = ("normal", "refracted")
 TEXTURE = (16, 8192)
-_JOBS = (0, 4096)
+_UNEVEN = 0.05
+"""Relative spread over which a prim that carries one value is told to vary."""
+_OUT_OF_REACH = "it lies in an instance of another file, out of a layer's reach; make the instance not instanceable"
+_STATE = "nothing was written"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,13 +55,48 @@ class ThicknessOrder:
         if self.along not in ALONG:
             raise UsageError(f"--along is '{self.along}', which is not known; choose from {', '.join(ALONG)}")
         if self.texture:
-            _in_range("--texture", self.texture, TEXTURE)
-        _in_range("--jobs", self.jobs, _JOBS)
+            check_range("--texture", self.texture, TEXTURE)
+        check_range("--jobs", self.jobs, JOBS)
 
 
-def _in_range(name: str, value: int, limits: tuple[int, int]) -> None:
-    if isinstance(value, bool) or not limits[0] <= value <= limits[1]:
-        raise UsageError(f"{name} is {value}; it must be between {limits[0]} and {limits[1]}")
+class How(NamedTuple):
+    """What to measure."""
+
+    along: str
+    texture: int
+    """[texels] on a side; 0 for primvars"""
+    jobs: int
+    go_on: Callable[[], None]
+    """Called now and then; what it raises ends the work."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """What was measured on one prim. Lengths in scene units."""
+
+    path: str
+    least: float
+    mean: float
+    most: float
+    how: str
+    """constant, vertex, faceVarying, or the name of the picture"""
+    notes: tuple[str, ...] = ()
+
+
+@dataclass
+class Work:
+    """What is gathered before anything is written."""
+
+    rows: list[Row] = field(default_factory=list)
+    left: list[Notice] = field(default_factory=list)
+    """What was left alone, and why."""
+    fixed: list[str] = field(default_factory=list)
+    """Prims whose model fixes the thickness."""
+    values: list[Values] = field(default_factory=list)
+    coats: dict[str, Coat] = field(default_factory=dict)
+    """Materials whose map comes before the primvars, by path"""
+    maps: list[Map] = field(default_factory=list)
+    pictures: dict[str, F32] = field(default_factory=dict)
 
 
 # --- the verb -------------------------------------------------------------------------------------------------------
@@ -71,27 +113,23 @@ def bake_thickness(order: ThicknessOrder, report: Report, cancel: Callable[[], b
     Raises:
         RefractError: whatever goes wrong.
     """
-    from ..usd.layers.write import check_out, is_over, overlay, save
-    from ..usd.stage import open_stage
-    from ..usd.thickness import MADE, lost_bindings, write_maps, write_values
-    from ..usd.thickness_find import find
-
     check_out(order.stage, order.out, overwrite=order.overwrite, ours=MADE)
     report.progress(0.0, "reading the stage")
     stage = open_stage(order.stage)
-    found = find(stage)
-    chosen = _chosen(found, order.only)
+    found = find_candidates(stage)
+    chosen = select(found.candidates, order.only, lambda one: one.paths, "glass")
     for notice in found.notices:
         report.warning(notice.path, notice.text)
     if not chosen:
         report.warning(order.stage, "has no glass; OUT is a layer that changes nothing")
     with folder_beside(order.out, "thickness") as folder:
-        files = _files(chosen, folder) if order.texture else {}
+        names = file_names(one.path for one in chosen) if order.texture else {}
+        files = {path: os.path.join(folder, name) for path, name in names.items()}
         if not (order.overwrite or is_over(order.out, order.stage, made=MADE)):
-            _refuse_existing(files.values())
-        how = How(order.along, order.texture, order.jobs, lambda: _stop_if(cancel))
-        work = measure_all(found, chosen, how, files, report.progress)
-        _stop_if(cancel)
+            refuse_existing(files.values())
+        how = How(order.along, order.texture, order.jobs, lambda: stop_if(cancel, _STATE))
+        work = _measure_all(found, chosen, how, files, report.progress)
+        stop_if(cancel, _STATE)
         layer = overlay(order.stage, made=MADE)
         write_values(layer, stage, work.values, _unmapped(work))
         bound = write_maps(layer, stage, work.maps)
@@ -120,32 +158,14 @@ def bake_over(
     Returns:
         What was left as it was, and why.
     """
-    from ..usd.thickness import write_values
-    from ..usd.thickness_find import find, stage_of
-
     stage = stage_of(layer)
-    found = find(stage)
+    found = find_candidates(stage)
     wanted = set(prims)
     chosen = [candidate for candidate in found.candidates if wanted & set(candidate.paths)]
-    how = How(along, 0, jobs, lambda: _stop_if(cancel))
-    work = measure_all(found, chosen, how, {}, lambda _fraction, _text: None)
+    how = How(along, 0, jobs, lambda: stop_if(cancel, _STATE))
+    work = _measure_all(found, chosen, how, {}, lambda _fraction, _text: None)
     write_values(layer, stage, work.values, _unmapped(work))
     return tuple(work.left)
-
-
-def _chosen(found: Found, only: tuple[str, ...]) -> list[Candidate]:
-    if not only:
-        return list(found.candidates)
-    for pattern in only:
-        if not any(_matches(one, pattern) for one in found.candidates):
-            known = ", ".join(one.path for one in found.candidates[:8]) or "none"
-            raise UsageError(f"--only {pattern}: no glass is there; the stage has {known}")
-    return [one for one in found.candidates if any(_matches(one, pattern) for pattern in only)]
-
-
-def _matches(candidate: Candidate, pattern: str) -> bool:
-    patterns = pattern, f"{pattern.rstrip('/')}/*"
-    return any(fnmatch.fnmatchcase(path, form) for path in candidate.paths for form in patterns)
 
 
 def _tell(report: Report, found: Found, work: Work, lost: Iterable[Notice]) -> None:
@@ -165,35 +185,156 @@ def _tell(report: Report, found: Found, work: Work, lost: Iterable[Notice]) -> N
             report.warning(row.path, note)
 
 
-def _stop_if(cancel: Callable[[], bool]) -> None:
-    if cancel():
-        raise Cancelled("cancelled; nothing was written")
-
-
 def _unmapped(work: Work) -> list[str]:
     return [coat.edit for coat in work.coats.values() if coat.edit]
 
 
-# --- pictures -------------------------------------------------------------------------------------------------------
-
-
-def _files(chosen: list[Candidate], folder: str) -> dict[str, str]:
-    """A picture's path for each prim."""
-    return {path: os.path.join(folder, name) for path, name in file_names(one.path for one in chosen).items()}
-
-
-def _refuse_existing(files: Iterable[str]) -> None:
-    for file in files:
-        if os.path.lexists(file):
-            raise UsageError(f"{file}: exists already; choose another OUT, or replace it with --overwrite")
-
-
 def _write_pictures(pictures: dict[str, F32]) -> None:
-    from ..images.pictures import write_map
-
     for file, picture in pictures.items():
-        try:
-            Path(file).parent.mkdir(exist_ok=True)
-        except OSError as error:
-            raise StageError(f"{Path(file).parent}: cannot be made: {error.strerror}; choose another OUT") from error
+        make_folder_of(file)
         write_map(file, picture, {"software": f"refract {__version__}"})
+
+
+# --- measuring ------------------------------------------------------------------------------------------------------
+
+
+def _measure_all(
+    found: Found, chosen: list[Candidate], how: How, files: dict[str, str], progress: Callable[[float, str], None]
+) -> Work:
+    """Measure some of the glass of a stage.
+
+    Args:
+        files: path of the picture of each candidate, where there are to be pictures.
+    """
+    work = Work()
+    for number, candidate in enumerate(chosen):
+        how.go_on()
+        progress(number / len(chosen), f"measuring {candidate.path}")
+        coats = tuple(coat for coat in candidate.coats if not coat.model.fixed_thickness)
+        if not coats:
+            work.fixed.append(candidate.path)
+            continue
+        candidate = replace(candidate, coats=coats)
+        body = _OUT_OF_REACH if not candidate.edit else read_body(candidate, found.time, wants_uv=bool(how.texture))
+        why = body if isinstance(body, str) else _one(candidate, body, found, how, files, work)
+        if why:
+            work.left.append(Notice(candidate.path, f"left alone: {why}"))
+    return work
+
+
+def _one(candidate: Candidate, body: Body, found: Found, how: How, files: dict[str, str], work: Work) -> str:
+    """Measure one prim and note what is to be written; says why where that cannot be."""
+    notes = [*body.notes, *_advice(candidate, how)]
+    if body.topology is None or not how.texture:
+        measured = _gprim(candidate, body, how, notes) if body.topology is None else None
+        values = _corners(candidate, body, how, notes) if measured is None else measured
+        if isinstance(values, str):
+            return values
+        kind, flat = ("constant", values) if body.topology is None else spread_values(body, values)
+        work.values.append(Values(candidate.edit, kind, flat))
+        work.coats.update({coat.material: coat for coat in candidate.coats if coat.mapped})
+        work.rows.append(_row(candidate, flat, kind, notes))
+        return ""
+    picture = _no_material(candidate) or _picture(candidate, body, how, notes)
+    if isinstance(picture, str):
+        return picture
+    file, most, mean = files[candidate.path], float(picture.max()), float(picture.mean())
+    work.pictures[file] = picture / most
+    for coat in candidate.coats:
+        alone = found.bound_to[coat.material] <= set(candidate.paths)
+        owner = candidate.edit.rsplit("/", 1)[-1]
+        tiled = body.uv is not None and is_tiled(body.uv)
+        work.maps.append(Map(coat, owner, alone, file, body.uv_name, most, mean, tiled))
+    work.rows.append(_row(candidate, picture, os.path.basename(file), notes))
+    return ""
+
+
+def _row(candidate: Candidate, values: F64 | F32, how: str, notes: list[str]) -> Row:
+    return Row(candidate.path, float(values.min()), float(values.mean()), float(values.max()), how, tuple(notes))
+
+
+def _advice(candidate: Candidate, how: How) -> Iterator[str]:
+    for coat in candidate.coats:
+        if coat.multiplier != 1.0:
+            yield (
+                f"inputs:refraction:thicknessMultiplier of {coat.material} is {coat.multiplier:g}, so that many times "
+                "what was measured is drawn; author 1"
+            )
+        if coat.mapped and not coat.edit:
+            yield f"the map of {coat.material} comes first, and lies in an instance, where it cannot be disconnected"
+    kinds = {(coat.model.behind is Behind.SLAB, coat.ior) for coat in candidate.coats}
+    if how.along == "refracted" and len(kinds) > 1:
+        yield f"it has several kinds of glass; that of {candidate.coats[0].material} is used for all of it"
+
+
+def _views(candidate: Candidate, how: How) -> F64:
+    coat = candidate.coats[0]
+    return views(coat.model.behind is Behind.SLAB, coat.ior, how.along)
+
+
+def _corners(candidate: Candidate, body: Body, how: How, notes: list[str]) -> F64 | str:
+    """Values at the triangle corners, shape (T, 3)."""
+    places, picks = corner_places(body.triangles, body.normals)
+    rays = _views(candidate, how)
+    values = measure(body.points, body.triangles, places, rays, jobs=how.jobs, go_on=how.go_on)
+    if lost := int(np.isnan(values).sum()):
+        if lost == len(values):
+            return "no ray found a far side"
+        notes.append(f"{lost} of {len(values)} places found no far side and take their neighbours' thickness")
+    return mended(values, picks)[picks]
+
+
+def _gprim(candidate: Candidate, body: Body, how: How, notes: list[str]) -> F64 | str:
+    """The one value that a gprim carries, shape (1,): a sphere's diameter, of others the median over the surface."""
+    rays = _views(candidate, how)
+    if body.radius > 0.0:  # a path of 2 R cos t
+        return np.array([2.0 * body.radius * (rays[:, 2] * rays[:, 3]).sum() / (rays[:, 3] ** 2).sum()])
+    values = measure(body.points, body.triangles, middle_places(body.normals), rays, jobs=how.jobs, go_on=how.go_on)
+    sides = body.points[body.triangles]
+    areas = np.linalg.norm(np.cross(sides[:, 1] - sides[:, 0], sides[:, 2] - sides[:, 0]), axis=1)
+    known = np.isfinite(values)
+    if not known.any():
+        return "no ray found a far side"
+    values, areas = values[known], areas[known]
+    rank = np.argsort(values)
+    half = np.searchsorted(np.cumsum(areas[rank]), areas.sum() / 2.0)
+    middle = float(values[rank][min(int(half), len(values) - 1)])
+    if values.max() - values.min() > _UNEVEN * middle:
+        kind = candidate.prim.GetTypeName()
+        notes.append(
+            f"a {kind} carries one value, so it has the median of {values.min():.4g} to {values.max():.4g}; "
+            "as a Mesh it could vary"
+        )
+    return np.array([middle])
+
+
+def _no_material(candidate: Candidate) -> str:
+    """Why there is no material that a picture could be connected to; '' where there is one."""
+    for coat in candidate.coats:
+        if not coat.applied:
+            return "its material has no RefractMaterialAPI to connect a picture to; run refract convert first"
+        if not (coat.edit and coat.bound):
+            return "its material lies in an instance, out of a layer's reach; leave out --texture"
+    return ""
+
+
+def _picture(candidate: Candidate, body: Body, how: How, notes: list[str]) -> F32 | str:
+    """Thickness by uv, shape (N, N)."""
+    if body.uv is None:
+        return "it has no uv for a picture; leave out --texture, which stores the thickness at the points"
+    if not (np.isfinite(body.uv).all() and np.abs(body.uv - 0.5).max() <= TILES + 0.5):
+        return f"its uv primvars:{body.uv_name} reaches more than {TILES:g} tiles away from 0 .. 1"
+    rays = _views(candidate, how)
+
+    def thickness(places: Places) -> F64:
+        return measure(body.points, body.triangles, places, rays, jobs=how.jobs, go_on=how.go_on)
+
+    picture, overlap = draw(body.uv, body.normals, how.texture, thickness)
+    if picture.max() <= 0.0:
+        return f"its uv primvars:{body.uv_name} covers no texel"
+    if overlap > OVERLAP:
+        notes.append(
+            f"its uv primvars:{body.uv_name} overlaps itself: {overlap:.0%} of the texels stand for several places and "
+            "hold their mean; leave out --texture, or unwrap it"
+        )
+    return picture

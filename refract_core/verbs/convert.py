@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-import fnmatch
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from ..errors import Cancelled, StageError, UsageError
-from ..files import folder_beside, replacing
+from ..errors import StageError, UsageError
+from ..files import folder_beside, write_whole
 from ..models import BY_TOKEN, MODELS, SHEET, SOLID, Behind, Model
 from ..scene import Notice
 from ..thickness.fit import alike, together
-
-if TYPE_CHECKING:
-    from ..usd.convert.author import Addition, Work
-    from ..usd.convert.find import Glass
-    from ..usd.convert.shapes import Use
+from ..usd.convert import gltf_stage
+from ..usd.convert.author import Addition, Work, add, begin
+from ..usd.convert.find import Glass, find_glass
+from ..usd.convert.standard import write_surfaces
+from ..usd.convert.uses import Use, find_uses
+from ..usd.layers.write import check_out, save
+from ..usd.values import neat
+from .orders import make_folder_of, refuse_existing, select, stop_if
 
 THICKNESS = ("typed", "measured")
 TARGETS = ("preview", "openpbr", "gltf")
@@ -106,23 +108,18 @@ def convert(
         StageError: the stage cannot be read, or OUT cannot be written.
         Cancelled: `cancel` said so; nothing was written.
     """
-    from ..usd.convert import author as usd
-    from ..usd.convert import shapes as convert_shapes
-    from ..usd.convert import surfaces as convert_to
-    from ..usd.layers import write
-
-    write.check_out(order.stage, order.out, overwrite=order.overwrite)
+    check_out(order.stage, order.out, overwrite=order.overwrite)
     progress(0.0, "opening")
     with folder_beside(order.out, "textures") as folder:
         work, found, pictures = _look(order, folder)
-        chosen = _chosen(found, order.only)
-        _go_on(cancel)
+        chosen = select(found, order.only, lambda glass: (glass.path,), "glass")
+        stop_if(cancel, "nothing was written")
         progress(0.5, "shapes")
-        uses = convert_shapes.find_uses(work.stage, work.time, [glass.path for glass in chosen if not glass.applied])
+        uses = find_uses(work.stage, work.time, [glass.path for glass in chosen if not glass.applied])
         plans = [_plan(glass, uses.get(glass.path, []), order.model, work.unit) for glass in chosen]
-        _go_on(cancel)
+        stop_if(cancel, "nothing was written")
         progress(0.8, "writing")
-        usd.add(work.layer, [addition for plan in plans for addition in plan.additions])
+        add(work.layer, [addition for plan in plans for addition in plan.additions])
         left: tuple[Notice, ...] = ()
         if order.thickness == "measured":
             from .bake_thickness import bake_over
@@ -132,64 +129,31 @@ def convert(
         rows = [plan.row for plan in plans]
         if order.to:
             within_reach = [row.path for row in rows if row.action != "skipped"]
-            told = convert_to.write_surfaces(work.layer, order.to, within_reach)
+            told = write_surfaces(work.layer, order.to, within_reach)
             rows = [replace(row, notes=(*row.notes, *told.get(row.path, ()))) for row in rows]
-        write.save(work.layer, order.out)
+        save(work.layer, order.out)
     return Converted(tuple(rows), (*work.notices, *left))
 
 
 def _look(order: ConvertOrder, pictures: str) -> tuple[Work, list[Glass], dict[str, bytes]]:
     """The stage with its glass, and the pictures that belong beside it: path and content."""
-    from ..usd.convert import author as usd
-    from ..usd.convert import find as convert_find
-    from ..usd.convert import gltf_stage as convert_gltf
-
     if order.stage.lower().endswith(GLTF):
-        work, found, content = convert_gltf.begin(order.stage, pictures)
-        _check_pictures(content, order.overwrite)
+        work, found, content = gltf_stage.begin(order.stage, pictures)
+        if not order.overwrite:
+            refuse_existing(path for path, picture in content.items() if not _holds(path, picture))
         return work, found, content
-    work = usd.begin(order.stage, flatten=order.flatten)
-    return work, convert_find.find_glass(work.stage, work.time, work.unit), {}
+    work = begin(order.stage, flatten=order.flatten)
+    return work, find_glass(work.stage, work.time, work.unit), {}
 
 
-def _check_pictures(pictures: dict[str, bytes], overwrite: bool) -> None:
-    for path, content in pictures.items():
-        if os.path.lexists(path) and not overwrite and not (os.path.isfile(path) and _content(path) == content):
-            raise UsageError(f"{path}: exists already, with another picture; remove it, or replace it with --overwrite")
-
-
-def _content(path: str) -> bytes:
-    with open(path, "rb") as file:
-        return file.read()
+def _holds(path: str, content: bytes) -> bool:
+    return os.path.isfile(path) and Path(path).read_bytes() == content
 
 
 def _write_pictures(pictures: dict[str, bytes]) -> None:
     for path, content in pictures.items():
-        with replacing(path, StageError) as temporary:
-            os.makedirs(os.path.dirname(path), exist_ok=True)
-            Path(temporary).write_bytes(content)
-
-
-def _go_on(cancel: Callable[[], bool]) -> None:
-    if cancel():
-        raise Cancelled("cancelled; nothing was written")
-
-
-def _chosen(found: list[Glass], only: tuple[str, ...]) -> list[Glass]:
-    """Those that `--only` names, by their own path or that of something above them."""
-    if not only:
-        return found
-    for pattern in only:
-        if not any(_matches(glass.path, pattern) for glass in found):
-            few = ", ".join(glass.path for glass in found[:5]) + (", ..." if len(found) > 5 else "")
-            known = f"there are {few}" if found else "there is none"
-            raise UsageError(f"--only {pattern}: no glass is there; {known}")
-    return [glass for glass in found if any(_matches(glass.path, pattern) for pattern in only)]
-
-
-def _matches(path: str, pattern: str) -> bool:
-    pattern = pattern.rstrip("/") or "/*"
-    return fnmatch.fnmatchcase(path, pattern) or fnmatch.fnmatchcase(path, f"{pattern}/*")
+        make_folder_of(path)
+        write_whole(path, content, StageError)
 
 
 # --- one material ---------------------------------------------------------------------------------------------------
@@ -202,7 +166,7 @@ def _plan(glass: Glass, uses: list[Use], forced: str, unit: float) -> _Plan:
         forced: the model of `--model`, or ''.
         unit: metres per scene unit.
     """
-    row = Row(glass.path, glass.shader, "applied", ior=_neat(glass.ior), abbe=_neat(glass.abbe), shapes=len(uses))
+    row = Row(glass.path, glass.shader, "applied", ior=neat(glass.ior), abbe=neat(glass.abbe), shapes=len(uses))
     if glass.applied:
         return _Plan(replace(row, action="kept", why="RefractMaterialAPI is there already; nothing is changed"))
     if not glass.edit:
@@ -253,18 +217,18 @@ def _thickness(glass: Glass, uses: list[Use]) -> tuple[float | None, dict[str, f
     The second is None where one prim is drawn in several sizes, so that no typed number holds.
     """
     if glass.thickness > 0.0:
-        return _neat(glass.thickness), {}, ["thickness as its shader has it"]
+        return neat(glass.thickness), {}, ["thickness as its shader has it"]
     by_use = {use: [fit.thickness for fit in use.fits if fit.thickness > 0.0] for use in uses if not use.typed}
     every = [value for values in by_use.values() for value in values]
     if not every:
         return None, {}, ["nothing to take a thickness from; author inputs:refraction:thickness"] if not uses else []
-    middle = _neat(median(every))
+    middle = neat(median(every))
     if alike(every):
         return middle, {}, []
     several = [use.path for use, values in by_use.items() if not (alike(values) and use.edit and use.whole)]
     if several:
         return middle, None, [f"{several[0]} is drawn in several sizes; the median is used"]
-    per_prim = {use.edit: _neat(median(values)) for use, values in by_use.items() if values}
+    per_prim = {use.edit: neat(median(values)) for use, values in by_use.items() if values}
     return middle, per_prim, [f"shapes differ in size: {len(per_prim)} prims get primvars:refraction:thickness"]
 
 
@@ -272,7 +236,7 @@ def _absorption(
     glass: Glass, model: Model, thickness: float | None, unit: float, notes: list[str]
 ) -> tuple[tuple[float, float, float], float | None]:
     """Colour and the distance after which it is left; None where the model fixes it or nothing is absorbed."""
-    color = tuple(_neat(value) for value in glass.color)
+    color = tuple(neat(value) for value in glass.color)
     clear = color == (1.0, 1.0, 1.0) and not glass.color_from
     if model.fixed_thickness:
         own = f"the {model.token} model's {model.fixed_thickness * 1000:g} mm"
@@ -283,20 +247,18 @@ def _absorption(
             return color, None  # type: ignore[return-value]
         # After the way through a wall of fixed thickness, color^(thickness / distance) is left.
         power = model.fixed_thickness / (glass.distance * unit)
-        notes.append(f"colour taken from {_neat(glass.distance):g} units to {own}")
-        return tuple(_neat(value**power) for value in color), None  # type: ignore[return-value]
+        notes.append(f"colour taken from {neat(glass.distance):g} units to {own}")
+        return tuple(neat(value**power) for value in color), None  # type: ignore[return-value]
     if clear:
         return color, None  # type: ignore[return-value]
     if glass.distance is not None:
-        return color, _neat(glass.distance)  # type: ignore[return-value]
+        return color, neat(glass.distance)  # type: ignore[return-value]
     distance = thickness if model.sized and thickness else 1.0
     notes.append(f"its colour tints a surface at any depth; here it is left after {distance:g} units")
     return color, distance  # type: ignore[return-value]
 
 
 def _additions(glass: Glass, row: Row, per_prim: dict[str, float]) -> Iterable[Addition]:
-    from ..usd.convert.author import Addition
-
     values: dict[str, Any] = {"refraction:model": row.model, "inputs:refraction:ior": row.ior}
     connections: dict[str, str] = {}
     if row.color != (1.0, 1.0, 1.0) or row.color_from:
@@ -313,8 +275,3 @@ def _additions(glass: Glass, row: Row, per_prim: dict[str, float]) -> Iterable[A
     yield Addition(glass.edit, True, mine, wired)
     for path, thickness in per_prim.items():
         yield Addition(path, False, {"primvars:refraction:thickness": thickness}, {})
-
-
-def _neat(value: float) -> float:
-    """Six digits: what float32 holds, and a person can read."""
-    return float(f"{value:.6g}")

@@ -29,23 +29,23 @@ from __future__ import annotations
 import json
 import textwrap
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from ..errors import Cancelled
 from ..models import Behind
 from ..scene import F64, Camera, Param, Source
+from ..usd.materials.read import API
+from ..usd.rules.findings import WARNING, Finding
+from ..usd.rules.glass import Glass
+from ..usd.rules.overview import Overview, overview_of
+from ..usd.rules.probes import share
+from ..usd.values import neat
 from ..version import __version__
+from .orders import stop_if
 from .validate import SEVERITIES, finding_record
 
-if TYPE_CHECKING:
-    from ..usd.rules.glass import Glass
-    from ..usd.rules.look import Look
-    from ..usd.rules.values import Finding
-
 FORMAT = "refract.inspect/1"
-API = "RefractMaterialAPI"
 WIDTH = 100
 _ROWS = {"glass": 10, "probes": 5, "unsupported": 5, "suspicious": 4}
 """Entries of each list that the plain text shows."""
@@ -61,12 +61,8 @@ def inspect(stage: str, cancel: Callable[[], bool] = lambda: False) -> Report:
     Raises:
         StageError: the stage cannot be opened.
     """
-    from ..usd.rules.look import look
-    from ..usd.rules.probes import share
-
-    seen = look(stage)
-    if cancel():
-        raise Cancelled("cancelled")
+    seen = overview_of(stage)
+    stop_if(cancel)
     scene = seen.scene
     shares = [[(probe.path, share(probe, piece)) for probe in scene.probes] for piece in seen.glass]
     layers = _layers(scene.cameras[0] if scene.cameras else None, seen.glass)
@@ -109,7 +105,7 @@ def _cameras(cameras: Sequence[Camera]) -> list[Report]:
     ]
 
 
-def _glass(piece: Glass, seen: Look, inside: list[tuple[str, float]], layers: int | None) -> Report:
+def _glass(piece: Glass, seen: Overview, inside: list[tuple[str, float]], layers: int | None) -> Report:
     reached = [{"path": path, "share": round(part, 3)} for path, part in inside if part > 0.0]
     thickness = piece.thickness
     how = "default" if thickness.how == "typed" and piece.row.name not in seen.typed else thickness.how
@@ -119,26 +115,22 @@ def _glass(piece: Glass, seen: Look, inside: list[tuple[str, float]], layers: in
         "by": API if piece.row.name in seen.with_api else "surface shader",
         "model": piece.model.name.lower(),
         "ior": _ior(piece.row.inputs[Param.IOR]),
-        "thickness": {"how": how, "least": _short(thickness.low), "most": _short(thickness.high)},
+        "thickness": {"how": how, "least": neat(thickness.low), "most": neat(thickness.high)},
         "closed": piece.closed,
         "convex": piece.convex,
-        "size": [_short(side) for side in piece.sides],
+        "size": [neat(side) for side in piece.sides],
         "layers": layers,
         "tiers": _tiers(seen, bool(reached)),
         "probes": reached,
     }
 
 
-def _short(value: float) -> float:
-    return float(f"{value:.6g}")
-
-
 def _ior(source: Source) -> Report:
     by = "texture" if source.texture >= 0 else "primvar" if source.primvar else "constant"
-    return {"value": _short(source.value[0]) if by == "constant" else None, "by": by}
+    return {"value": neat(source.value[0]) if by == "constant" else None, "by": by}
 
 
-def _tiers(seen: Look, reached: bool) -> list[str]:
+def _tiers(seen: Overview, reached: bool) -> list[str]:
     """Tiers that have something to say. Where a stage has no probe at all, each piece of glass gets its own."""
     able = {
         "screen": True,
@@ -149,7 +141,7 @@ def _tiers(seen: Look, reached: bool) -> list[str]:
     return [tier for tier in seen.settings.tiers if able[tier]]
 
 
-def _probes(seen: Look, shares: list[list[tuple[str, float]]]) -> list[Report]:
+def _probes(seen: Overview, shares: list[list[tuple[str, float]]]) -> list[Report]:
     return [
         {
             "path": probe.path,
@@ -163,10 +155,8 @@ def _probes(seen: Look, shares: list[list[tuple[str, float]]]) -> list[Report]:
     ]
 
 
-def _too_deep(seen: Look, layers: list[int | None]) -> list[Finding]:
+def _too_deep(seen: Overview, layers: list[int | None]) -> list[Finding]:
     """Glass behind more glass than a render draws."""
-    from ..usd.rules.values import WARNING, Finding
-
     most, limit = max((count or 0 for count in layers), default=0), seen.settings.max_layers
     if most <= limit:
         return []

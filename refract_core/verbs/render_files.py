@@ -10,18 +10,21 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ..errors import Cancelled, ImageError, UsageError
+from ..errors import ImageError, UsageError
 from ..files import write_whole
+from ..probes.digest import stale_bakes
 from ..progress import Report
 from ..scene import Notice, Scene
 from ..settings import RenderSettings
 from .executors import Bench, Crew, file_bytes, patience, sent_stage, spread
+from .orders import size_text, stop_if
 from .override import OverrideError, Overrides, check_overrides, override, override_notes
 
 if TYPE_CHECKING:
     from ..images.frame import Frame
 
 COMPLEXITIES = ("low", "medium", "high", "veryhigh")
+_STATE = "no unfinished file was left"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,8 +142,8 @@ def _render_here(stage: Any, shots: Sequence[_Shot], tell: Tell, report: Report,
     read = partial(scene_from_stage, stage)
     for done, shot in enumerate(shots):
         started = time.perf_counter()
-        frame = _draw(read, shot, tell, _part(report, done, len(shots)), cancel)
-        _stop_if(cancel)
+        frame = _draw(read, shot, tell, _frame_progress(report, done, len(shots)), cancel)
+        stop_if(cancel, _STATE)
         frame.save(shot.path, aovs=shot.aovs, color_correction=shot.color_correction)
         _say_done(report, shot, frame.width, frame.height, time.perf_counter() - started)
 
@@ -159,7 +162,7 @@ def _draw(
     """
     from ..rendering.picture import render
 
-    _stop_if(cancel)
+    stop_if(cancel, _STATE)
     settings = shot.settings
 
     def changed(*, strict: bool = False, **how: Any) -> Scene:
@@ -171,7 +174,7 @@ def _draw(
     tell(scene.notices)
     if shot.first:
         tell(_stale(changed, scene, settings))
-    _stop_if(cancel)
+    stop_if(cancel, _STATE)
     frame = render(scene, settings, progress=progress, cancel=cancel)
     tell(frame.notices)
     return replace(frame, metadata={**frame.metadata, **override_notes(shot.materials)})
@@ -200,7 +203,7 @@ def _render_elsewhere(
     root = stage.GetRootLayer()
     sent = sent_stage(order.stage, root.realPath or root.identifier)
     report.progress(0.0, "waiting for the first frame")
-    results = spread(crew, _picture, shots, sent, stop=partial(_stop_if, cancel), waiting=patience(report))
+    results = spread(crew, _picture, shots, sent, stop=partial(stop_if, cancel, _STATE), waiting=patience(report))
     for done, (shot, picture) in enumerate(results, 1):
         tell(picture.notices)
         write_whole(shot.path, picture.data, ImageError)
@@ -223,15 +226,13 @@ def _unheard(_fraction: float, _stage: str) -> None:
 
 def _say_done(report: Report, shot: _Shot, width: int, height: int, seconds: float) -> None:
     size = os.path.getsize(shot.path)
-    report.done(shot.path, f"{width} x {height}, {_bytes(size)}, {seconds:.1f} s")
+    report.done(shot.path, f"{width} x {height}, {size_text(size)}, {seconds:.1f} s")
 
 
 def _stale(read: Callable[..., Scene], scene: Scene, settings: RenderSettings) -> list[Notice]:
     """Baked probes that no longer show what is there; each is asked about the time it was baked at."""
     if not any(probe.bake for probe in scene.probes):
         return []
-    from .bake_probes import stale_bakes
-
     def scene_at(time_code: float) -> Scene:
         if time_code == scene.time_code and settings.purposes == RenderSettings().purposes:
             return scene
@@ -248,7 +249,7 @@ def _settings(authored: Mapping[str, object], overrides: Mapping[str, object]) -
     return RenderSettings(**chosen)
 
 
-def _part(report: Report, done: int, count: int) -> Callable[[float, str], None]:
+def _frame_progress(report: Report, done: int, count: int) -> Callable[[float, str], None]:
     """Progress of one frame as progress of all."""
     prefix = f"frame {done + 1} of {count}: " if count > 1 else ""
     return lambda fraction, stage: report.progress((done + fraction) / count, prefix + stage)
@@ -261,12 +262,3 @@ def _flag() -> Iterator[None]:
         yield
     except OverrideError as error:
         raise UsageError(f"--override {error}") from error
-
-
-def _stop_if(cancel: Callable[[], bool]) -> None:
-    if cancel():
-        raise Cancelled("cancelled; no unfinished file was left")
-
-
-def _bytes(count: int) -> str:
-    return f"{count / 1e6:.1f} MB" if count >= 1_000_000 else f"{max(count // 1000, 1)} kB"

@@ -20,13 +20,14 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from ..errors import Cancelled
+from ..usd.layers.write import check_out, overlay, save
+from ..usd.rules.findings import Finding, apply_repairs
+from ..usd.rules.stage import stage_findings, stock_findings
+from ..usd.stage import open_stage
 from ..version import __version__
-
-if TYPE_CHECKING:
-    from ..usd.rules.values import Finding
+from .orders import stop_if
 
 FORMAT = "refract.validate/1"
 MADE = "validate --fix"
@@ -67,9 +68,6 @@ def validate(order: ValidateOrder, cancel: Callable[[], bool] = lambda: False) -
         StageError: the stage cannot be opened, or the layer cannot be written.
         UsageError: the layer may not be written there.
     """
-    from ..usd.layers.write import check_out, overlay, save
-    from ..usd.rules.values import apply_repairs
-
     if order.fix:
         check_out(order.stage, order.fix, overwrite=order.overwrite, ours=MADE)
     found = _check(order.stage, cancel)
@@ -77,7 +75,7 @@ def validate(order: ValidateOrder, cancel: Callable[[], bool] = lambda: False) -
         return Verdict(order.stage, found)
     layer = overlay(order.stage, made=MADE)
     apply_repairs(layer, (repair for finding in found for repair in finding.repairs))
-    _stop_if(cancel)
+    stop_if(cancel)
     save(layer, order.fix)
     left = _check(order.fix, cancel)
     still = Counter(_key(finding) for finding in left)
@@ -86,14 +84,11 @@ def validate(order: ValidateOrder, cancel: Callable[[], bool] = lambda: False) -
 
 
 def _check(stage: str, cancel: Callable[[], bool]) -> tuple[Finding, ...]:
-    from ..usd.rules.stage import stage_findings, stock_findings
-    from ..usd.stage import open_stage
-
     opened = open_stage(stage)
     found = stage_findings(opened)
-    _stop_if(cancel)
+    stop_if(cancel)
     found += stock_findings(opened)
-    _stop_if(cancel)
+    stop_if(cancel)
     once = {(finding.rule, finding.path, finding.text): finding for finding in found}
     return tuple(sorted(once.values(), key=lambda finding: SEVERITIES.index(finding.severity)))
 
@@ -101,11 +96,6 @@ def _check(stage: str, cancel: Callable[[], bool]) -> tuple[Finding, ...]:
 def _key(finding: Finding) -> tuple[str, str, str]:
     """The same finding on a layer over the stage."""
     return finding.rule, finding.path if finding.path.startswith("/") else "", finding.about
-
-
-def _stop_if(cancel: Callable[[], bool]) -> None:
-    if cancel():
-        raise Cancelled("cancelled")
 
 
 # --- words ----------------------------------------------------------------------------------------------------------

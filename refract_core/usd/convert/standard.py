@@ -16,6 +16,7 @@ from ...scene import Material, Notice, Param, Source, Texture
 from ..materials.read import read_material
 from ..materials.sources import is_constant
 from ..stage import stage_unit, time_range
+from ..values import neat
 from .find import editable
 
 
@@ -161,16 +162,12 @@ def _mapped(record: Material, target: _Target) -> list[str]:
 
 
 def _one(record: Material, param: Param) -> float:
-    return _neat(record.inputs[param].value[0])
+    return neat(record.inputs[param].value[0])
 
 
 def _three(source: Source) -> tuple[float, float, float]:
-    r, g, b = (_neat(value) for value in source.value[:3])
+    r, g, b = (neat(value) for value in source.value[:3])
     return r, g, b
-
-
-def _neat(value: float) -> float:
-    return float(f"{value:.6g}")
 
 
 def _body(record: Material, emission: str, coat: str, coat_roughness: str) -> _Inputs:
@@ -204,14 +201,14 @@ def _preview(record: Material, unit: float) -> tuple[_Inputs, _Inputs]:
 def _open_pbr(record: Material, unit: float) -> tuple[_Inputs, _Inputs]:
     thin = record.model.behind is Behind.SHEET
     glass: _Inputs = {
-        "transmission_weight": _neat(1.0 - _one(record, Param.OPACITY)),
+        "transmission_weight": neat(1.0 - _one(record, Param.OPACITY)),
         "specular_ior": _one(record, Param.IOR),
         "transmission_color": _three(record.inputs[Param.TRANSMITTANCE]),
-        "transmission_depth": 0.0 if thin else _neat(record.absorption_distance / unit),
+        "transmission_depth": 0.0 if thin else neat(record.absorption_distance / unit),
         "geometry_thin_walled": thin,
     }
     if record.abbe > 0.0:
-        glass |= {"transmission_dispersion_scale": 1.0, "transmission_dispersion_abbe_number": _neat(record.abbe)}
+        glass |= {"transmission_dispersion_scale": 1.0, "transmission_dispersion_abbe_number": neat(record.abbe)}
     rest: _Inputs = {
         "base_color": _base(record),
         "base_metalness": _one(record, Param.METALLIC),
@@ -227,15 +224,15 @@ def _gltf(record: Material, unit: float) -> tuple[_Inputs, _Inputs]:
     thin = record.model.behind is Behind.SHEET
     tint = _three(record.inputs[Param.TRANSMITTANCE])
     glass: _Inputs = {
-        "transmission": _neat(1.0 - _one(record, Param.OPACITY)),
+        "transmission": neat(1.0 - _one(record, Param.OPACITY)),
         "ior": _one(record, Param.IOR),
         # A wall without thickness has no volume; its colour is the base colour.
-        "thickness": 0.0 if thin else _neat(record.inputs[Param.THICKNESS].value[0] / unit),
+        "thickness": 0.0 if thin else neat(record.inputs[Param.THICKNESS].value[0] / unit),
     }
     if not thin and tint != (1.0, 1.0, 1.0):
-        glass |= {"attenuation_color": tint, "attenuation_distance": _neat(record.absorption_distance / unit)}
+        glass |= {"attenuation_color": tint, "attenuation_distance": neat(record.absorption_distance / unit)}
     if record.abbe > 0.0:
-        glass["dispersion"] = _neat(20.0 / record.abbe)
+        glass["dispersion"] = neat(20.0 / record.abbe)
     rest: _Inputs = {
         # One colour for both: where some of the surface is left, other renderers tint the glass with it too.
         "base_color": _base(record, tint) if thin else _base(record),

@@ -1,3 +1,3 @@
-"""Reflection probes as records, with their pictures, and bakes written down beside them."""
+"""Reflection probes as records, with their pictures, and bakes written down beside them. Takes no picture."""
 
-__all__ = ["bakes", "pictures", "read", "values", "volumes"]
+__all__ = ["pictures", "read"]

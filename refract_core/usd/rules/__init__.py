@@ -1,3 +1,5 @@
-"""What a stage should keep, what was found against it, and how it is mended; what a person sees of a stage."""
+"""What a stage should keep, what is found against it, and how that is mended; what a person sees of a stage. Knows no
+command. USD itself enters by `plugin`, which no other wing needs.
+"""
 
-__all__ = ["glass", "look", "plugin", "probes", "stage", "values"]
+__all__ = ["findings", "glass", "overview", "probes", "stage"]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...models import SHEET, Behind, Model, model_for
 from ...scene import F64, Material, Mesh, Param, Scene, Source, Sphere
 from ...thickness.fit import CONVEX_TOLERANCE
-from .values import ERROR, WARNING, Finding, Repair, Rule
+from .findings import ERROR, WARNING, Finding, Rule
 
 FLAT = 0.2
 """A body is flat whose smallest side is under this part of its largest."""
@@ -194,25 +194,21 @@ def glass_findings(scene: Scene, glass: list[Glass], unsure: Collection[str] = (
     return found
 
 
-def _finding(rule: Rule, path: str, text: str, fix: str, about: str = "", repairs: tuple[Repair, ...] = ()) -> Finding:
-    return Finding(rule.id, rule.severity, path, text, fix, about, repairs)
-
-
 def _shape(piece: Glass) -> Iterator[Finding]:
     convert = "run refract convert, which chooses a model by the shape"
     model, flat = f"the {piece.model.token} model of {piece.row.name}", model_for(Behind.SLAB).token
     if piece.model.behind is Behind.MESH and not piece.closed:
         text = f"{model} is on an open mesh, which has no far side; it is drawn as '{SHEET.token}'"
-        yield _finding(TRACED_OPEN, piece.path, text, f"close the mesh, or set refraction:model to '{SHEET.token}'")
+        yield TRACED_OPEN.broken(piece.path, text, f"close the mesh, or set refraction:model to '{SHEET.token}'")
     elif piece.model.row.needs_closed and not piece.closed:
         text = f"{model} is on an open mesh, which has no inside; use {SHEET.token} or {flat}"
         fix = f"set refraction:model to '{SHEET.token}', or {convert}"
-        yield _finding(OPEN, piece.path, text, fix, "refraction:model")
+        yield OPEN.broken(piece.path, text, fix, "refraction:model")
     elif piece.model.behind is Behind.BALL and piece.sides[0] < FLAT * piece.sides[2]:
         a, b, c = piece.sides
         text = f"{model} is on a flat body of {a:.3g} x {b:.3g} x {c:.3g} m"
         fix = f"set refraction:model to '{flat}', or {convert}"
-        yield _finding(FLAT_SPHERE, piece.path, text, fix, "refraction:model")
+        yield FLAT_SPHERE.broken(piece.path, text, fix, "refraction:model")
 
 
 def _lengths(piece: Glass, unit: float) -> Iterator[Finding]:
@@ -230,15 +226,15 @@ def _lengths(piece: Glass, unit: float) -> Iterator[Finding]:
                 f"{size:.3g} m; in {name} it would fit, but the unit of this stage is {unit:g} m"
             )
             fix = f"multiply inputs:refraction:thickness of {piece.row.name} by {factor:g}"
-            yield _finding(UNITS, piece.path, text, fix, about)
+            yield UNITS.broken(piece.path, text, fix, about)
             return
     measured = "run refract bake thickness STAGE OUT, which measures it"
     if high > LONGER * piece.sides[2]:
         text = f"the thickness of {piece.row.name} is {high:.3g} m, but the body is {piece.sides[2]:.3g} m at most"
-        yield _finding(SIZE, piece.path, text, measured, about)
+        yield SIZE.broken(piece.path, text, measured, about)
     elif piece.model.behind is Behind.BALL and high < THINNER * piece.sides[0]:
         text = f"the thickness of {piece.row.name} is {high:.3g} m, but the body is {piece.sides[0]:.3g} m at least"
-        yield _finding(SIZE, piece.path, text, f"{measured}; a hollow body wants the {SHEET.token} model", about)
+        yield SIZE.broken(piece.path, text, f"{measured}; a hollow body wants the {SHEET.token} model", about)
 
 
 def _no_uv(piece: Glass) -> Finding:
@@ -246,13 +242,13 @@ def _no_uv(piece: Glass) -> Finding:
     name = f"primvars:{source.uv_primvar}" if source.uv_primvar else "any primvar (its texture has no inputs:st)"
     text = f"the thickness map of {piece.row.name} reads {name}, which is not there, so all of it has one thickness"
     fix = "author the uv, or run refract bake thickness STAGE OUT, which stores it at the points"
-    return _finding(NO_UV, piece.path, text, fix, source.uv_primvar)
+    return NO_UV.broken(piece.path, text, fix, source.uv_primvar)
 
 
 def _inside_out(piece: Glass) -> Finding:
     text = "the mesh is closed but its faces look inwards, so light enters where it should leave"
     fix = "turn its orientation attribute round, or reverse its faces"
-    return _finding(INSIDE_OUT, piece.path, text, fix, "orientation")
+    return INSIDE_OUT.broken(piece.path, text, fix, "orientation")
 
 
 def _holds(outer: Glass, inner: Glass) -> bool:

@@ -15,20 +15,19 @@ from ...scene import Model, Scene
 from ...settings import RenderSettings
 from ..geometry.parts import Bound, Tables, bind
 from ..geometry.traverse import Placement
-from ..materials.read import read_material
-from ..ours import applied
+from ..materials.read import has_api, read_material
 from ..settings import read_settings
 from ..stage import open_stage, scene_from_stage, stage_unit, time_range
-from .glass import Glass, glass_findings, glass_of
+from .findings import Finding
+from .glass import Glass, glass_of
 from .probes import probe_findings, texture_state
-from .stage import UNREADABLE, reader_findings, scenes_of, with_repair
-from .values import Finding, fallback_findings, readable, value_findings
+from .stage import UNREADABLE, glass_found, reader_findings, scenes_of
+from .values import fallback_findings, readable, value_findings
 
-API = "RefractMaterialAPI"
-EMPTY = "nothing is visible"
+_EMPTY = "nothing is visible"
 
 
-class Look(NamedTuple):
+class Overview(NamedTuple):
     """A stage as it was found."""
 
     up_axis: str
@@ -54,8 +53,8 @@ class Look(NamedTuple):
     suspicious: list[Finding]
 
 
-def look(path: str) -> Look:
-    """Look through a stage at its first time code.
+def overview_of(path: str) -> Overview:
+    """A stage at its first time code.
 
     Raises:
         StageError: it cannot be opened.
@@ -64,7 +63,8 @@ def look(path: str) -> Look:
     values = value_findings(stage)
     other = readable(stage, values)
     found = [*values, *fallback_findings(stage)]
-    settings, scene = _settings(other, found), _empty(stage)
+    settings = _settings(other, found)
+    scene = Scene((), (), metres_per_unit=stage_unit(stage, []), name=stage.GetRootLayer().identifier)
     drawn: list[Placement] = []
 
     def keep(placements: list[Placement], tables: Tables) -> list[Placement]:
@@ -74,15 +74,15 @@ def look(path: str) -> Look:
     try:
         scene = scene_from_stage(other, purposes=settings.purposes, camera=settings.camera, keep=keep)
     except StageError as error:
-        found.append(Finding(UNREADABLE.id, UNREADABLE.severity, path, str(error), ""))
+        found.append(UNREADABLE.broken(path, str(error)))
     glass = glass_of(scene)
-    found += [with_repair(finding, stage) for finding in glass_findings(scene, glass, _unsure(values))]
+    found += glass_found(stage, scene, glass, values)
     # A digest is of everything a probe sees, so then everything has to be read.
     baked = any(probe.bake is not None for probe in scene.probes)
     scene_at = scenes_of(other, scene_from_stage(other, purposes=settings.purposes)) if baked else None
     found += probe_findings(other, scene, glass, scene_at)
     materials = {piece.row.name for piece in glass}
-    return Look(
+    return Overview(
         up_axis=str(UsdGeom.GetStageUpAxis(stage)),
         unit_authored=UsdGeom.StageHasAuthoredMetersPerUnit(stage),
         times=time_range(stage),
@@ -92,28 +92,20 @@ def look(path: str) -> Look:
         settings=settings,
         scene=scene,
         glass=glass,
-        with_api=frozenset(name for name in materials if _has_api(stage, name)),
+        with_api=frozenset(name for name in materials if (prim := stage.GetPrimAtPath(name)) and has_api(prim)),
         typed=frozenset(name for name in materials if _is_typed(stage, name)),
         states={probe.path: texture_state(other, probe, scene_at) for probe in scene.probes},
         # Without glass the reader is left with nothing, and says so; that is only true where nothing else is drawn.
-        unsupported=reader_findings([n for n in scene.notices if not (drawn and n.text.startswith(EMPTY))], found),
+        unsupported=reader_findings([n for n in scene.notices if not (drawn and n.text.startswith(_EMPTY))], found),
         suspicious=found,
     )
-
-
-def _empty(stage: Usd.Stage) -> Scene:
-    return Scene((), (), metres_per_unit=stage_unit(stage, []), name=stage.GetRootLayer().identifier)
-
-
-def _unsure(values: list[Finding]) -> set[str]:
-    return {finding.path for finding in values if finding.about == "inputs:refraction:thickness"}
 
 
 def _settings(stage: Usd.Stage, found: list[Finding]) -> RenderSettings:
     try:
         authored = read_settings(stage)
     except StageError as error:
-        found.append(Finding(UNREADABLE.id, UNREADABLE.severity, "/", str(error), ""))
+        found.append(UNREADABLE.broken("/", str(error)))
         authored = {}
     return RenderSettings(**authored)  # type: ignore[arg-type]
 
@@ -153,7 +145,7 @@ def _is_glass(material: UsdShade.Material, tables: Tables) -> bool:
 
 def _is_plain(material: UsdShade.Material) -> bool:
     """A UsdPreviewSurface of constants that says nothing of opacity: there is no glass in it, and nothing to follow."""
-    if API in material.GetPrim().GetPrimTypeInfo().GetAppliedAPISchemas():
+    if has_api(material.GetPrim()):
         return False
     shader = material.ComputeSurfaceSource("")[0]
     if not shader or shader.GetShaderId() != "UsdPreviewSurface" or material.GetOutput("mtlx:surface"):
@@ -163,11 +155,6 @@ def _is_plain(material: UsdShade.Material) -> bool:
         return False
     inputs = [shader.GetPrim().GetAttribute(name) for name in names if name.startswith("inputs:")]
     return not any(attribute.HasAuthoredConnections() for attribute in inputs)
-
-
-def _has_api(stage: Usd.Stage, path: str) -> bool:
-    prim = stage.GetPrimAtPath(path)
-    return bool(prim) and API in applied(prim)
 
 
 def _is_typed(stage: Usd.Stage, path: str) -> bool:

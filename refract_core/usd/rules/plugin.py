@@ -6,7 +6,7 @@ under one root make USD lose the schemas. So programs that have the package name
 
     PXR_PLUGINPATH_NAME=.../schemas:.../schemas/validators
 
-and Python that runs `refract_core.usd.rules_plugin.register()` needs no variable. Python validators exist in USD from
+and Python that runs `refract_core.usd.rules.plugin.register()` needs no variable. Python validators exist in USD from
 26.05 on; the command `refract validate` calls the rules themselves and needs none of this.
 """
 
@@ -19,8 +19,9 @@ from typing import Any
 from pxr import Plug, Sdf, Usd
 
 from ..registering import FOLDER
+from .findings import ERROR, WARNING, Finding
 from .stage import PLUGIN, scene_findings
-from .values import ERROR, WARNING, Finding, values_of_prim
+from .values import values_of_prim
 
 VALUES, SCENE = f"{PLUGIN}:Values", f"{PLUGIN}:Scene"
 

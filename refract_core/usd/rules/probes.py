@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Usd
 
+from ...probes.digest import stale_bakes
 from ...scene import F64, Probe, Scene, Volume
 from ...version import __version__
+from .findings import ERROR, INFO, WARNING, Finding, Rule
 from .glass import Glass, winding
-from .values import ERROR, INFO, WARNING, Finding, Rule
 
 _POINTS = 2000
 """Points of a piece of glass that are asked whether a probe reaches them."""
@@ -47,11 +48,7 @@ def texture_state(stage: Usd.Stage, probe: Probe, scene_at: SceneAt | None) -> s
         return "stale"
     if scene_at is None:
         return "baked"
-    from ...probes.digest import probe_digest
-
-    scene = scene_at(probe.bake.time_code)
-    same = next((other for other in scene.probes if other.path == probe.path), None)
-    return "baked" if same is not None and probe_digest(scene, same) == probe.bake.digest else "stale"
+    return "stale" if stale_bakes([probe], scene_at) else "baked"
 
 
 def probe_findings(stage: Usd.Stage, scene: Scene, glass: list[Glass], scene_at: SceneAt | None) -> list[Finding]:
@@ -66,24 +63,20 @@ def probe_findings(stage: Usd.Stage, scene: Scene, glass: list[Glass], scene_at:
     return found
 
 
-def _finding(rule: Rule, path: str, text: str, fix: str, about: str = "") -> Finding:
-    return Finding(rule.id, rule.severity, path, text, fix, about)
-
-
 def _picture(probe: Probe, state: str) -> Iterator[Finding]:
     about, bake = "probe:texture", "run refract bake probes STAGE OUT"
     if state == "missing":
         custom = probe.mode == "custom"
         text = "probe:texture is not set, or is no picture that can be read; the surroundings are captured instead"
         fix = "name an existing picture in probe:texture" + ("" if custom else f", or {bake}")
-        yield _finding(MISSING, probe.path, text, fix, about)
+        yield MISSING.broken(probe.path, text, fix, about)
     elif state == "none":
         text = "probe:mode is 'baked' but nothing has been baked; the probe is captured again for every render"
-        yield _finding(UNBAKED, probe.path, text, bake, about)
+        yield UNBAKED.broken(probe.path, text, bake, about)
     elif state == "stale" and probe.bake is not None:
         old = probe.bake.engine
         why = f"by version {old} of the engine" if old != __version__ else "of a scene that has changed since"
-        yield _finding(STALE, probe.path, f"probe:texture was baked {why}", bake, about)
+        yield STALE.broken(probe.path, f"probe:texture was baked {why}", bake, about)
 
 
 def _standing(probe: Probe, scene: Scene, glass: list[Glass]) -> Iterator[Finding]:
@@ -97,7 +90,7 @@ def _standing(probe: Probe, scene: Scene, glass: list[Glass]) -> Iterator[Findin
         if path not in refractive and seen and not any(holds(other) for other in others):
             text = f"the capture point is inside {path}, so the picture shows that from within"
             fix = "move the probe, or author probe:captureOffset"
-            yield _finding(INSIDE, probe.path, text, fix, "probe:captureOffset")
+            yield INSIDE.broken(probe.path, text, fix, "probe:captureOffset")
             return
 
 
@@ -117,7 +110,7 @@ def _solids_at(scene: Scene, point: F64) -> Iterator[tuple[str, Callable[[F64], 
 def _outside(piece: Glass) -> Finding:
     text = "no probe's influence reaches this glass, so what the screen does not show comes from the sky"
     fix = "make a probe's influence larger, add a RefractProbe here, or render with --tiers screen,ray,sky"
-    return _finding(OUTSIDE, piece.path, text, fix)
+    return OUTSIDE.broken(piece.path, text, fix)
 
 
 def share(probe: Probe, piece: Glass) -> float:

@@ -11,25 +11,10 @@ from ...errors import StageError
 from ...scene import Notice, Scene
 from ..diagnostics import captured, words_of
 from ..stage import scene_from_stage
-from .glass import FLAT_SPHERE, INSIDE_OUT, NO_UV, OPEN, SIZE, TRACED_OPEN, UNITS, glass_findings, glass_of
+from .findings import ERROR, INFO, WARNING, Finding, Repair, Rule
+from .glass import FLAT_SPHERE, INSIDE_OUT, NO_UV, OPEN, SIZE, TRACED_OPEN, UNITS, Glass, glass_findings, glass_of
 from .probes import INSIDE, MISSING, OUTSIDE, STALE, UNBAKED, SceneAt, probe_findings
-from .values import (
-    ERROR,
-    FALLBACK,
-    FINITE,
-    INFO,
-    IOR,
-    RANGE,
-    THIN,
-    TOKEN,
-    WARNING,
-    Finding,
-    Repair,
-    Rule,
-    fallback_findings,
-    readable,
-    value_findings,
-)
+from .values import FALLBACK, FINITE, IOR, RANGE, THIN, TOKEN, fallback_findings, readable, value_findings
 
 UNREADABLE = Rule("refract.unreadable", ERROR, "The renderer can read the stage.")
 READER = Rule("refract.reader", WARNING, "The renderer uses what is authored as it is authored.")
@@ -58,12 +43,21 @@ def scene_findings(stage: Usd.Stage) -> list[Finding]:
     try:
         scene = scene_from_stage(other)
     except StageError as error:
-        return [*found, Finding(UNREADABLE.id, UNREADABLE.severity, stage.GetRootLayer().identifier, str(error), "")]
+        return [*found, UNREADABLE.broken(stage.GetRootLayer().identifier, str(error))]
     glass = glass_of(scene)
-    unsure = {finding.path for finding in values if finding.about == "inputs:refraction:thickness"}
-    found += [with_repair(finding, stage) for finding in glass_findings(scene, glass, unsure)]
+    found += glass_found(stage, scene, glass, values)
     found += probe_findings(other, scene, glass, scenes_of(other, scene))
     return [*found, *reader_findings(scene.notices, [*values, *found])]
+
+
+def glass_found(stage: Usd.Stage, scene: Scene, glass: list[Glass], values: list[Finding]) -> list[Finding]:
+    """What is wrong with the glass of a stage, with repairs where they are safe.
+
+    Args:
+        values: what `value_findings` found; a thickness that is wrong in itself tells nothing about the size.
+    """
+    unsure = {finding.path for finding in values if finding.about == "inputs:refraction:thickness"}
+    return [_with_repair(finding, stage) for finding in glass_findings(scene, glass, unsure)]
 
 
 def scenes_of(stage: Usd.Stage, scene: Scene) -> SceneAt:
@@ -82,13 +76,13 @@ def reader_findings(notices: Iterable[Notice], known: list[Finding]) -> list[Fin
     for finding in known:
         told.setdefault(finding.path, []).append(finding.about)
     return [
-        Finding(READER.id, READER.severity, notice.path, notice.text, "")
+        READER.broken(notice.path, notice.text)
         for notice in notices
         if not any(about and about in notice.text for about in told.get(notice.path, []))
     ]
 
 
-def with_repair(finding: Finding, stage: Usd.Stage) -> Finding:
+def _with_repair(finding: Finding, stage: Usd.Stage) -> Finding:
     """With the repair that needs the prim: the other orientation."""
     prim = stage.GetPrimAtPath(finding.path) if "[" not in finding.path else None
     if finding.rule != INSIDE_OUT.id or not prim or prim.IsInstanceProxy() or not prim.IsA(UsdGeom.Mesh):
@@ -116,7 +110,7 @@ def stock_findings(stage: Usd.Stage) -> list[Finding]:
             errors = context.Validate(stage)
         except Tf.ErrorException as error:  # damaged values, which none of them expects
             said = " ".join(dict.fromkeys(words_of(part) for part in error.args))
-            return [Finding(UNREADABLE.id, ERROR, "/", f"USD's own validators gave up: {said}", "")]
+            return [UNREADABLE.broken("/", f"USD's own validators gave up: {said}")]
     return [
         Finding(
             str(error.GetIdentifier()),

@@ -1,8 +1,4 @@
-"""Rules that a stage should keep, and what is found against them: the values of our attributes, looked at one by one.
-
-A rule is *safe* to fix where the value as it is cannot have been meant: what is written over it is what the renderer
-uses in its place, or the one word or orientation that was meant. Nothing is guessed, and no opinion is removed.
-"""
+"""Rules about the values of our attributes, looked at one by one; nothing of the stage needs to be drawn for that."""
 
 from __future__ import annotations
 
@@ -15,48 +11,11 @@ from pxr import Sdf, Usd, UsdShade
 from ...models import BY_TOKEN, LEAST_THICKNESS, Model
 from .. import ours
 from ..stage import stage_unit
+from ..values import finite, listed, numbers
+from .findings import ERROR, WARNING, Finding, Repair, Rule
 
-ERROR, WARNING, INFO = "error", "warning", "info"
 _MAX_SAMPLES = 10_000
 """Time samples of one attribute that are looked at."""
-
-
-class Rule(NamedTuple):
-    """What a stage should keep."""
-
-    id: str
-    severity: str
-    says: str
-    """The rule in one sentence."""
-    safe: bool = False
-    """`--fix` repairs it."""
-
-
-class Repair(NamedTuple):
-    """One attribute with other values; the path `/` and the name of a field stand for metadata of the stage."""
-
-    path: str
-    name: str
-    values: tuple[tuple[float | None, Any], ...] = ()
-    """By time code; None is the default value."""
-
-
-class Finding(NamedTuple):
-    """A place where a rule is broken."""
-
-    rule: str
-    severity: str
-    path: str
-    """Prim path, or the stage's file."""
-    text: str
-    """One sentence: what is wrong, and the range it should be in."""
-    fix: str
-    """What to do: a command, or what to author."""
-    about: str = ""
-    """The attribute; '' where it is the prim as a whole."""
-    repairs: tuple[Repair, ...] = ()
-    """Empty where it is not safe to repair without a person."""
-
 
 IOR = Rule("refract.ior-below-one", ERROR, "An index of refraction is 1 or more.", safe=True)
 TOKEN = Rule("refract.unknown-token", ERROR, "A token is one of those the schema allows (case is mended).", safe=True)
@@ -67,7 +26,6 @@ FALLBACK = Rule(
     "refract.no-fallback-types", WARNING, "A stage with our prim types says what programs without them take.", safe=True
 )
 
-_ALLOWED = "allowedTokens"
 _SIZED = " or ".join(f"'{model.token}'" for model in Model if model.sized)
 # Where the lowest value itself is out of the range; the schema's limits cannot say so.
 _ABOVE_ZERO = frozenset(
@@ -96,8 +54,8 @@ def _fields() -> dict[str, tuple[_Field, ...]]:
             if name.startswith("collection:") or value is None or isinstance(value, (bool, Sdf.AssetPath)):
                 continue
             hard = dict(spec.GetInfo("limits") or {}).get("hard", {})
-            low, high = (_numbers(hard[end]) if end in hard else () for end in ("minimum", "maximum"))
-            tokens = tuple(map(str, spec.GetInfo(_ALLOWED) or ()))
+            low, high = (numbers(hard[end]) if end in hard else () for end in ("minimum", "maximum"))
+            tokens = tuple(map(str, spec.GetInfo("allowedTokens") or ()))
             rows.append(_Field(str(name), tokens, low or (), high or (), value))
         found[api] = tuple(rows)
     return found
@@ -166,35 +124,35 @@ def _of_attribute(attribute: Usd.Attribute, field: _Field, unit: float) -> Itera
         repairs = (Repair(str(attribute.GetPrim().GetPath()), attribute.GetName(), values),)
     where = str(attribute.GetPrim().GetPath())
     name = attribute.GetName()
-    text = f"{name} is {_shown(value)}{when}; {_range(field)}"
+    text = f"{name} is {_shown(value)}{when}; it must be {_wanted(field)}"
     better = judged[bad[0]][1]
     fix = f"author {name} = {_shown(better)}" if better is not None else f"author {name} {_wanted(field)}"
-    yield Finding(rule.id, rule.severity, where, text, fix, name, repairs)
+    yield rule.broken(where, text, fix, name, repairs)
 
 
 def _judge(value: Any, field: _Field, unit: float) -> tuple[Rule | None, Any]:
     """The rule that a value breaks, and the value to put in its place; the value itself where it is good."""
     if field.tokens:
         return _judge_tokens(value, field.tokens)
-    numbers, wanted = _numbers(value), _numbers(field.fallback)
-    if numbers is None or wanted is None:
+    found, wanted = numbers(value), numbers(field.fallback)
+    if found is None or wanted is None:
         return None, value
-    if len(numbers) != len(wanted):
+    if len(found) != len(wanted):
         return RANGE, None
-    if not all(map(math.isfinite, numbers)):
+    if not finite(found):
         return FINITE, field.fallback
     above = field.name in _ABOVE_ZERO
-    low = field.low or (-math.inf,) * len(numbers)
-    high = field.high or (math.inf,) * len(numbers)
-    under = [n <= least if above else n < least for n, least in zip(numbers, low, strict=True)]
-    over = [n > most for n, most in zip(numbers, high, strict=True)]
+    low = field.low or (-math.inf,) * len(found)
+    high = field.high or (math.inf,) * len(found)
+    under = [n <= least if above else n < least for n, least in zip(found, low, strict=True)]
+    over = [n > most for n, most in zip(found, high, strict=True)]
     if not any(under) and not any(over):
         return None, value
     if field.name == "inputs:refraction:ior":
         return IOR, 1.0
     if above:
         return RANGE, LEAST_THICKNESS / unit if field.name == "inputs:refraction:thickness" else field.fallback
-    inside = [min(max(n, a), b) for n, a, b in zip(numbers, low, high, strict=True)]
+    inside = [min(max(n, a), b) for n, a, b in zip(found, low, high, strict=True)]
     return RANGE, type(field.fallback)(*inside) if len(inside) > 1 else type(field.fallback)(inside[0])
 
 
@@ -209,34 +167,20 @@ def _judge_tokens(value: Any, allowed: tuple[str, ...]) -> tuple[Rule | None, An
     return TOKEN, mended if several else mended[0]
 
 
-def _numbers(value: Any) -> tuple[float, ...] | None:
-    if isinstance(value, str):
-        return None
-    try:
-        return tuple(float(part) for part in value) if hasattr(value, "__len__") else (float(value),)
-    except (TypeError, ValueError):
-        return None
-
-
 def _shown(value: Any) -> str:
     if isinstance(value, str):
         return f"'{value}'"
-    numbers = _numbers(value)
-    if numbers is None:
+    found = numbers(value)
+    if found is None:
         return str(value) if not hasattr(value, "__len__") else ", ".join(map(str, value))
-    listed = ", ".join(f"{number:g}" for number in numbers)
-    return listed if len(numbers) == 1 else f"({listed})"
-
-
-def _range(field: _Field) -> str:
-    return f"it must be {_wanted(field)}"
+    return listed(found)
 
 
 def _wanted(field: _Field) -> str:
     if field.tokens:
         single = isinstance(field.fallback, str)
         return f"{'one' if single else 'some'} of {', '.join(field.tokens)}{'' if single else ', each at most once'}"
-    count = len(_numbers(field.fallback) or ())
+    count = len(numbers(field.fallback) or ())
     many = "" if count == 1 else f"{count} values, each "
     if field.name in _ABOVE_ZERO:
         return f"{many}above 0"
@@ -252,7 +196,7 @@ def _of_fixed(prim: Usd.Prim, model: Model) -> Iterator[Finding]:
             fixed = f"the {model.token} model fixes it at {model.fixed_thickness * 1000:g} mm"
             text = f"{name} is authored but does nothing: {fixed}"
             fix = f"block {name}, or set refraction:model to {_SIZED} where the thickness matters"
-            yield Finding(THIN.id, THIN.severity, str(prim.GetPath()), text, fix, name)
+            yield THIN.broken(str(prim.GetPath()), text, fix, name)
 
 
 def fallback_findings(stage: Usd.Stage) -> list[Finding]:
@@ -267,7 +211,7 @@ def fallback_findings(stage: Usd.Stage) -> list[Finding]:
     fix = "run refract validate STAGE --fix OUT, or call WriteFallbackPrimTypes of the stage"
     repair = Repair("/", "fallbackPrimTypes")
     path = stage.GetRootLayer().identifier
-    return [Finding(FALLBACK.id, FALLBACK.severity, path, text, fix, "fallbackPrimTypes", (repair,))]
+    return [FALLBACK.broken(path, text, fix, "fallbackPrimTypes", (repair,))]
 
 
 def readable(stage: Usd.Stage, findings: Iterable[Finding]) -> Usd.Stage:
@@ -286,16 +230,3 @@ def readable(stage: Usd.Stage, findings: Iterable[Finding]) -> Usd.Stage:
         if value is not None and not prim.IsInstanceProxy():
             prim.GetAttribute(finding.about).Set(value)
     return other
-
-
-def apply_repairs(layer: Sdf.Layer, repairs: Iterable[Repair]) -> None:
-    """Write repairs into a layer that lies over the stage they were found on."""
-    stage = Usd.Stage.Open(layer)
-    stage.SetEditTarget(layer)
-    for repair in repairs:
-        if repair.path == "/":
-            ours.write_fallback_types(stage)
-            continue
-        attribute = stage.GetPrimAtPath(repair.path).GetAttribute(repair.name)
-        for time, value in repair.values:
-            attribute.Set(value, Usd.TimeCode.Default() if time is None else Usd.TimeCode(time))

@@ -93,7 +93,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Found:
-    """What `find` finds."""
+    """What `find_candidates` finds."""
 
     candidates: tuple[Candidate, ...]
     bound_to: dict[str, frozenset[str]]
@@ -107,7 +107,7 @@ class Found:
 # --- which prims ----------------------------------------------------------------------------------------------------
 
 
-def find(stage: Usd.Stage) -> Found:
+def find_candidates(stage: Usd.Stage) -> Found:
     """Every prim that is drawn with glass at the stage's first time, in the order of the stage.
 
     Raises:
@@ -142,7 +142,7 @@ def find(stage: Usd.Stage) -> Found:
 
 
 def stage_of(layer: Sdf.Layer) -> Usd.Stage:
-    """The stage whose root a layer is."""
+    """The stage whose root a layer is; a door for those who know no USD."""
     return recognised(Usd.Stage.Open(layer))
 
 
