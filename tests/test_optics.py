@@ -210,14 +210,6 @@ def test_fresnel_is_the_same_from_both_sides() -> None:
     assert optics.fresnel_dielectric(cos_t, GLASS) == pytest.approx(entering, abs=1e-9)
 
 
-def test_schlick_joins_f0_and_one_and_stays_near_fresnel() -> None:
-    cos_i = np.linspace(0.0, 1.0, 200)
-    schlick = optics.fresnel_schlick(cos_i, 0.04)
-    assert schlick[[0, -1]] == pytest.approx([1.0, 0.04])
-    assert np.all(np.diff(schlick) <= 0.0)
-    assert np.abs(schlick - optics.fresnel_dielectric(cos_i, 1 / GLASS)).max() < 0.05
-
-
 # --- Absorption -----------------------------------------------------------------------------------------------------
 
 

@@ -88,24 +88,6 @@ def test_dispersion_keeps_the_abbe_number(ior: float, abbe: float) -> None:
     assert (blue - red) * abbe == pytest.approx(ior - 1.0, abs=1e-9)
 
 
-@UNTIMED
-@given(f=st.floats(0.0, 1.0), a=st.floats(0.0, 1.0))
-def test_thin_wall_is_the_sum_of_its_bounces(f: float, a: float) -> None:
-    reflected, passed = optics_scalar.thin_wall(f, a)
-    if f < 0.99:
-        bounces = np.arange(4000)
-        assert passed == pytest.approx(np.sum((1 - f) ** 2 * a * (f * a) ** (2 * bounces)), abs=1e-9)
-        assert reflected == pytest.approx(f + np.sum((1 - f) ** 2 * a**2 * f * (f * a) ** (2 * bounces)), abs=1e-9)
-    assert reflected + passed <= 1.0 + 1e-12
-
-
-def test_thin_wall_loses_nothing_when_clear() -> None:
-    for f in (0.0, 0.04, 0.5, 1.0):
-        reflected, passed = optics_scalar.thin_wall(f, 1.0)
-        assert reflected == pytest.approx(2.0 * f / (1.0 + f))
-        assert reflected + passed == pytest.approx(1.0)
-
-
 def test_transmitted_lobe_is_the_measured_width() -> None:
     assert optics_scalar.transmitted_roughness(1.0, 1.5, False) == pytest.approx(0.408, abs=1e-3)
     # alpha_t / alpha behind two interfaces of n = 1.5, from the Monte Carlo of benchmarks/lobe.py

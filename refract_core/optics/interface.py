@@ -1,6 +1,6 @@
 """Optics of one ray: the only definition of every formula, as scalar functions over (x, y, z) tuples.
 
-Kernels call these directly; `optics` calls the same functions for arrays. Directions are unit vectors, `i` travels
+Kernels call these directly; `arrays` runs the same functions over arrays. Directions are unit vectors, `i` travels
 towards the surface, `wo` away from it towards the viewer, `n` stands on the side the light comes from. Lengths are
 metres. `eta_i_over_t` is the ior of the medium the ray is in over that of the medium it enters.
 Nothing here raises: a ray that cannot be refracted says so in its result.
@@ -73,14 +73,6 @@ def f0_from_ior(ior: float) -> float:
     """Reflectance at normal incidence seen from vacuum, ((n - 1) / (n + 1))^2 (Fresnel)."""
     r = (ior - 1.0) / (ior + 1.0)
     return r * r
-
-
-@inlined
-def fresnel_schlick(cos_i: float, f0: float) -> float:
-    """f0 + (1 - f0)(1 - cos_i)^5 (Schlick 1994): what HDRP's table becomes on a smooth surface."""
-    x = 1.0 - saturate(cos_i)
-    x2 = x * x
-    return f0 + (1.0 - f0) * (x2 * x2 * x)
 
 
 @inlined
@@ -168,23 +160,6 @@ def channel_iors(ior: float, abbe: float) -> tuple[float, float, float]:
     red = ior + slope * (1.0 / (c * c) - 1.0 / (d * d))
     blue = ior + slope * (1.0 / (f * f) - 1.0 / (d * d))
     return max(red, 1.0), ior, max(blue, 1.0)
-
-
-@inlined
-def thin_wall(f: float, a: float) -> tuple[float, float]:
-    """Sum of all bounces between the two faces of a thin sheet (Stokes 1862).
-
-    Args:
-        f: Reflectance of one face, 0 .. 1.
-        a: Transmittance of the inside along one crossing, 0 .. 1.
-
-    Returns:
-        Reflectance and transmittance of the sheet.
-    """
-    if f >= 1.0:
-        return 1.0, 0.0
-    through = (1.0 - f) * (1.0 - f) / (1.0 - f * f * a * a)
-    return f + f * through * a * a, through * a
 
 
 @inlined
