@@ -19,9 +19,10 @@ from typer.testing import CliRunner, Result
 import schemas
 from refract_core.cli import app
 from refract_core.probes.digest import probe_digest
+from refract_core.thickness.solid import is_convex, signed_volume, winding
 from refract_core.usd.rules import plugin as rules_plugin
 from refract_core.usd.rules.findings import Finding
-from refract_core.usd.rules.glass import is_convex, sides, signed_volume, winding
+from refract_core.usd.rules.glass import sides
 from refract_core.usd.rules.stage import RULES, stage_findings, stock_findings
 from refract_core.usd.stage import load_stage, open_stage
 from refract_core.verbs.validate import ValidateOrder, validate

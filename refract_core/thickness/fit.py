@@ -21,13 +21,12 @@ from numpy.typing import NDArray
 
 from ..models import Behind, Model, model_for
 from ..scene import F64
+from .solid import crossings, is_convex, signed_volume
 
 SPHERE_RESIDUAL = 0.05
 """A ball: root mean square distance of the surface from the best sphere, against its radius."""
 BOX_RESIDUAL = 0.04
 """A box: root mean square distance of the surface from the nearest side of its box, against the smallest side."""
-CONVEX_TOLERANCE = 0.005
-"""Convex: no vertex lies further than this in front of any face, against the diagonal of the bounding box."""
 CAVITY_WALL = 0.3
 """Hollow: the median wall, measured along the inward normal, is under this part of the smallest side, ..."""
 CAVITY_SHARE = 0.25
@@ -43,7 +42,6 @@ _WELD = 1.0e-6
 """Points nearer than this, against the diagonal, are one."""
 _PARTS = 64
 """Of more separate parts than this, as many are looked at, spread over all."""
-_FACES = 512
 _RAYS = 256
 _TESTS = 4_000_000
 """Ray-triangle tests spent on one part."""
@@ -82,7 +80,7 @@ def fit(points: F64, triangles: NDArray[np.integer]) -> Fit:
     parts = _parts(corners, len(points))
     if len(parts) > _PARTS:
         parts = [parts[int(place)] for place in np.linspace(0, len(parts) - 1, _PARTS)]
-    volumes = [_volume(points, part) for part in parts]
+    volumes = [signed_volume(points, part) for part in parts]
     largest = max(volumes, key=abs)
     if len(parts) > 1 and any(_inside(points, a, points, b) for a, b in _cavities(parts, volumes, largest)):
         side = _smallest_side(points[np.unique(corners)])
@@ -161,12 +159,6 @@ def _parts(corners: Index, count: int) -> list[Index]:
     return np.split(corners[order], cuts)
 
 
-def _volume(points: F64, corners: Index) -> float:
-    """Signed volume; positive where the faces look outwards."""
-    a, b, c = (points[corners[:, side]] - points[corners[0, 0]] for side in range(3))
-    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum()) / 6.0
-
-
 def _cavities(parts: list[Index], volumes: list[float], largest: float) -> list[tuple[Index, Index]]:
     """Pairs of a part that is turned against the largest one, and that largest part."""
     outer = parts[volumes.index(largest)]
@@ -202,7 +194,7 @@ def _surface(points: F64, corners: Index) -> _Surface:
     used, number = np.unique(corners, return_inverse=True)
     corners = number.reshape(-1, 3)
     points = points[used] - points[used].mean(axis=0)
-    if _volume(points, corners) < 0.0:
+    if signed_volume(points, corners) < 0.0:
         corners = corners[:, ::-1]
     around = points[corners]
     normals = np.cross(around[:, 1] - around[:, 0], around[:, 2] - around[:, 0])
@@ -217,7 +209,7 @@ def _fit_part(points: F64, corners: Index) -> Fit:
     part = _surface(points, corners)
     if not len(part.corners):
         return Fit(_WALL, 0.0, True, False, "closed, but without a volume")
-    if _is_convex(part):
+    if is_convex(part.points, part.corners):
         diameter, round_off = _sphere(part)
         if round_off <= SPHERE_RESIDUAL:
             return Fit(_BALL, diameter, True, True, f"closed, convex, a ball within {_percent(round_off)}")
@@ -228,7 +220,7 @@ def _fit_part(points: F64, corners: Index) -> Fit:
         return Fit(_ANY, side, True, True, f"closed, convex, neither a ball nor a box ({off})")
     side, _ = _box(part)
     wall, share = _walls(part)
-    sheet = 2.0 * _volume(part.points, part.corners) / float(part.areas.sum()) >= SHEET * wall
+    sheet = 2.0 * signed_volume(part.points, part.corners) / float(part.areas.sum()) >= SHEET * wall
     if (wall <= SHEET_WALL * side and sheet) or (wall <= CAVITY_WALL * side and share >= CAVITY_SHARE):
         return Fit(_WALL, side, True, False, f"hollow: walls of {_percent(wall / side)} of its smallest side")
     return Fit(_ANY, side, True, False, "closed, not convex")
@@ -236,17 +228,6 @@ def _fit_part(points: F64, corners: Index) -> Fit:
 
 def _percent(value: float) -> str:
     return f"{100.0 * value:.1f} %"
-
-
-def _is_convex(part: _Surface) -> bool:
-    """No vertex stands in front of a face; of many faces, an even choice is looked at."""
-    faces = np.unique(np.linspace(0, len(part.corners) - 1, _FACES).astype(np.int64))
-    limit = CONVEX_TOLERANCE * float(np.linalg.norm(np.ptp(part.points, axis=0)))
-    for chosen in np.array_split(faces, max(1, len(faces) * len(part.points) // 4_000_000)):
-        planes = np.einsum("ij,ij->i", part.normals[chosen], part.samples[chosen, 3])
-        if (part.points @ part.normals[chosen].T - planes).max() > limit:
-            return False
-    return True
 
 
 def _weights(part: _Surface) -> F64:
@@ -335,26 +316,9 @@ def _walls(part: _Surface) -> tuple[float, float]:
         away = squares - 2.0 * (middles @ origin) + origin @ origin
         along = middles @ direction - origin @ direction
         near = np.flatnonzero(away - along**2 <= reach * 1.001 + 1.0e-9 * squares)
-        hits = _crossings(part.samples[near[near != face]], origin, direction)
+        hits, _ = crossings(part.samples[near[near != face], :3], origin, direction)
         if not len(hits):
             continue
         walls.append(float(hits[0]))
         gaps += len(hits) > 1 and float(hits[1] - hits[0]) > walls[-1]
     return (float(np.median(walls)), gaps / count) if walls else (math.inf, 0.0)
-
-
-def _crossings(around: F64, origin: F64, direction: F64) -> F64:
-    """Sorted distances at which a ray meets triangles (Moeller and Trumbore 1997); `around` has shape (T, >= 3, 3)."""
-    a = around[:, 0]
-    e1, e2 = around[:, 1] - a, around[:, 2] - a
-    p = np.cross(direction, e2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1.0 / np.einsum("ij,ij->i", e1, p)
-        away = origin - a
-        u = np.einsum("ij,ij->i", away, p) * inverse
-        q = np.cross(away, e1)
-        v = (q @ direction) * inverse
-        t = np.einsum("ij,ij->i", e2, q) * inverse
-        met = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.0)
-    found: F64 = np.sort(t[met])
-    return found

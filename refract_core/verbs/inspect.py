@@ -35,6 +35,7 @@ import numpy as np
 
 from ..models import Behind
 from ..scene import F64, Camera, Param, Source
+from ..thickness.solid import crossings
 from ..usd.materials.read import API
 from ..usd.rules.findings import WARNING, Finding
 from ..usd.rules.glass import Glass
@@ -205,22 +206,15 @@ def _crossed(origin: F64, direction: F64, glass: list[Glass], low: F64, high: F6
 
 
 def _entries(origin: F64, direction: F64, piece: Glass) -> int:
-    """Moeller and Trumbore, Journal of Graphics Tools 2(1), 1997."""
+    """Surfaces of one piece of glass that a ray enters."""
     if piece.radius > 0.0:
         to = piece.points[0] - origin
         along = float(to @ direction)
         struck = along > 0.0 and float(to @ to) - along**2 < piece.radius**2 < float(to @ to)
         return int(struck) * (2 if piece.model.behind is Behind.SHEET else 1)
-    at = piece.points[piece.triangles]
-    u, v, start = at[:, 1] - at[:, 0], at[:, 2] - at[:, 0], origin - at[:, 0]
-    across, turned = np.cross(direction, v), np.cross(start, u)
-    facing = (u * across).sum(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        first, second = (start * across).sum(axis=1) / facing, (turned @ direction) / facing
-        distance = (v * turned).sum(axis=1) / facing
-        hit = (first >= 0.0) & (second >= 0.0) & (first + second < 1.0) & (distance > 0.0)
+    distances, inwards = crossings(piece.points[piece.triangles], origin, direction)
     either = not piece.closed or piece.model.behind is Behind.SHEET
-    met = np.sort(distance[hit & (either | (facing > 0.0))])
+    met = distances if either else distances[inwards]
     # A ray through the edge of two triangles meets both of them.
     return int(len(met) > 0) + int((np.diff(met) > 1e-6 * met[1:]).sum())
 

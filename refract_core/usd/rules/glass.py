@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ...models import SHEET, Behind, Model, model_for
 from ...scene import F64, Material, Mesh, Param, Scene, Source, Sphere
-from ...thickness.fit import CONVEX_TOLERANCE
+from ...thickness.solid import is_convex, signed_volume, winding
 from .findings import ERROR, WARNING, Finding, Rule
 
 FLAT = 0.2
@@ -24,8 +24,6 @@ _MANY = 50.0
 _AGREES = 2.0
 """A thickness fits a body up to this factor, once its unit is put right."""
 _UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001}
-_FACES = 256
-"""Faces of a mesh whose planes are looked at for convexity."""
 
 OPEN = Rule("refract.sphere-on-open", ERROR, "The sphere model stands on a closed mesh.")
 FLAT_SPHERE = Rule("refract.sphere-on-flat", WARNING, "The sphere model stands on a body that is not flat.")
@@ -136,40 +134,6 @@ def sides(points: F64) -> tuple[float, float, float]:
     a, b, c = sorted(np.ptp(around @ axes, axis=0).tolist())
     straight = sorted(np.ptp(around, axis=0).tolist())
     return (a, b, c) if a * b * c < straight[0] * straight[1] * straight[2] else (straight[0], straight[1], straight[2])
-
-
-def is_convex(points: F64, triangles: NDArray[np.int64]) -> bool:
-    """No point stands in front of a face; of many faces, an even choice is looked at."""
-    step = max(1, len(triangles) // _FACES)
-    at = points[triangles[::step]]
-    normals = np.cross(at[:, 1] - at[:, 0], at[:, 2] - at[:, 0])
-    normals /= np.maximum(np.sqrt((normals**2).sum(axis=1, keepdims=True)), 1e-300)
-    if signed_volume(points, triangles) < 0.0:
-        normals = -normals
-    limit = CONVEX_TOLERANCE * float(np.linalg.norm(np.ptp(points, axis=0)))
-    for some in np.array_split(np.arange(len(at)), max(1, len(at) * len(points) // 4_000_000)):
-        heights = points @ normals[some].T - (normals[some] * at[some, 0]).sum(axis=1)
-        if heights.max() > limit:
-            return False
-    return True
-
-
-def signed_volume(points: F64, triangles: NDArray[np.int64]) -> float:
-    """[m3], by the divergence theorem: positive where a closed surface faces outwards."""
-    at = points[triangles] - points[triangles[0, 0]]
-    return float((at[:, 0] * np.cross(at[:, 1], at[:, 2])).sum() / 6.0)
-
-
-def winding(point: F64, points: F64, triangles: NDArray[np.int64]) -> float:
-    """How often a closed surface goes round a point: 1 inside, 0 outside, -1 inside one that is inside out.
-
-    Sum of the triangles' solid angles over 4 pi (Van Oosterom and Strackee, IEEE Trans. Biomed. Eng. 30(2), 1983).
-    """
-    a, b, c = (points[triangles[:, corner]] - point for corner in range(3))
-    la, lb, lc = (np.sqrt((side**2).sum(axis=1)) for side in (a, b, c))
-    above = (a * np.cross(b, c)).sum(axis=1)
-    below = la * lb * lc + (a * b).sum(axis=1) * lc + (b * c).sum(axis=1) * la + (c * a).sum(axis=1) * lb
-    return float(np.arctan2(above, below).sum() / (2.0 * np.pi))
 
 
 # --- rules ----------------------------------------------------------------------------------------------------------

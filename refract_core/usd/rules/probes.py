@@ -10,9 +10,10 @@ from pxr import Usd
 
 from ...probes.digest import stale_bakes
 from ...scene import F64, Probe, Scene, Volume
+from ...thickness.solid import winding
 from ...version import __version__
 from .findings import ERROR, INFO, WARNING, Finding, Rule
-from .glass import Glass, winding
+from .glass import Glass
 
 _POINTS = 2000
 """Points of a piece of glass that are asked whether a probe reaches them."""

@@ -12,6 +12,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from ...scene import F64, U32, Material, Model, Notice, Param, Texture
 from ...settings import PURPOSES
+from ...thickness.solid import signed_volume
 from ..convert.find import editable, find_glass, original
 from ..geometry.parts import Bound, bind
 from ..geometry.place import uniform_scale
@@ -233,7 +234,7 @@ def read_body(candidate: Candidate, time: Usd.TimeCode, *, wants_uv: bool) -> Bo
     points = shape.points.astype(np.float64) @ linear[0].T
     triangles = turned_over(shape.triangles) if mirrored else shape.triangles
     corners = points[triangles] - points[triangles[0, 0]]
-    if np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) <= 0.0:
+    if signed_volume(points, triangles) <= 0.0:
         return "its faces look inwards; turn its orientation round, unless it is a bubble in other glass"
     uv_name, uv = _uv(candidate.prim, shape, time, notices, mirrored) if wants_uv else ("", None)
     return Body(

@@ -1,0 +1,79 @@
+"""Closed meshes and rays through them, in plain numpy: what fitting, rules and reports ask of a shape.
+
+Points have shape (V, 3), triangles shape (T, 3); outside is where a triangle's corners run counter-clockwise.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..scene import F64
+
+CONVEX_TOLERANCE = 0.005
+"""Convex: no vertex lies further than this in front of any face, against the diagonal of the bounding box."""
+
+_FACES = 512
+"""Faces of a mesh whose planes are looked at for convexity."""
+
+
+def signed_volume(points: F64, triangles: NDArray[np.integer]) -> float:
+    """[cube of the unit], by the divergence theorem: positive where a closed surface faces outwards."""
+    a, b, c = (points[triangles[:, side]] - points[triangles[0, 0]] for side in range(3))
+    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum()) / 6.0
+
+
+def is_convex(points: F64, triangles: NDArray[np.integer]) -> bool:
+    """No point of a closed surface, which may be inside out, stands in front of a face; of many faces, an even choice
+    is looked at."""
+    faces = np.unique(np.linspace(0, len(triangles) - 1, _FACES).astype(np.int64))
+    at = points[triangles[faces]]
+    normals = np.cross(at[:, 1] - at[:, 0], at[:, 2] - at[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    if signed_volume(points, triangles) < 0.0:
+        normals = -normals
+    limit = CONVEX_TOLERANCE * float(np.linalg.norm(np.ptp(points, axis=0)))
+    for some in np.array_split(np.arange(len(at)), max(1, len(at) * len(points) // 4_000_000)):
+        heights = points @ normals[some].T - np.einsum("ij,ij->i", normals[some], at[some, 0])
+        if heights.max() > limit:
+            return False
+    return True
+
+
+def winding(point: F64, points: F64, triangles: NDArray[np.integer]) -> float:
+    """How often a closed surface goes round a point: 1 inside, 0 outside, -1 inside one that is inside out.
+
+    Sum of the triangles' solid angles over 4 pi (Van Oosterom and Strackee, IEEE Trans. Biomed. Eng. 30(2), 1983).
+    """
+    a, b, c = (points[triangles[:, corner]] - point for corner in range(3))
+    la, lb, lc = (np.sqrt((side**2).sum(axis=1)) for side in (a, b, c))
+    above = (a * np.cross(b, c)).sum(axis=1)
+    below = la * lb * lc + (a * b).sum(axis=1) * lc + (b * c).sum(axis=1) * la + (c * a).sum(axis=1) * lb
+    return float(np.arctan2(above, below).sum() / (2.0 * np.pi))
+
+
+def crossings(corners: F64, origin: F64, direction: F64) -> tuple[F64, NDArray[np.bool_]]:
+    """Where a ray meets triangles (Moeller and Trumbore, Journal of Graphics Tools 2(1), 1997).
+
+    Args:
+        corners: shape (T, 3, 3): the corners of each triangle.
+        origin, direction: shape (3,), in the frame of the corners.
+
+    Returns:
+        Shape (N,): distances > 0 in lengths of `direction`, sorted; and whether the ray goes inwards there. A ray
+        through an edge meets both of its triangles.
+    """
+    a = corners[:, 0]
+    e1, e2 = corners[:, 1] - a, corners[:, 2] - a
+    p = np.cross(direction, e2)
+    facing = np.einsum("ij,ij->i", e1, p)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = 1.0 / facing
+        away = origin - a
+        u = np.einsum("ij,ij->i", away, p) * inverse
+        q = np.cross(away, e1)
+        v = (q @ direction) * inverse
+        t = np.einsum("ij,ij->i", e2, q) * inverse
+        met = np.flatnonzero((u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.0))
+    met = met[np.argsort(t[met], kind="stable")]
+    return t[met], facing[met] > 0.0
