@@ -19,10 +19,6 @@ class Aov(NamedTuple):
     """The plane has shape (H, W), without an axis for its channel."""
 
 
-def _scalar(name: str) -> Aov:
-    return Aov((name,), scalar=True)
-
-
 AOVS: dict[str, Aov] = {
     "beauty": Aov(("R", "G", "B", "A"), color=True),
     "refraction": Aov(("refraction.R", "refraction.G", "refraction.B"), color=True),
@@ -31,7 +27,7 @@ AOVS: dict[str, Aov] = {
     "N": Aov(("N.X", "N.Y", "N.Z")),
     "P": Aov(("P.X", "P.Y", "P.Z")),
 } | {
-    name: _scalar(name)
+    name: Aov((name,), scalar=True)
     for name in (
         "Z",
         "mask",

@@ -61,17 +61,13 @@ def _mip_chain(cubemap: Cubemap, layout: str) -> tuple[list[F32], int]:
     chain = [_arranged(cubemap.levels[0], layout)]
     for level in cubemap.levels[1:]:
         picture = _arranged(level, layout)
-        if picture.shape[:2] != _half_size(chain[-1]):
+        if picture.shape[:2] != tuple(max(1, side // 2) for side in chain[-1].shape[:2]):
             break
         chain.append(picture)
     exact = len(chain)
     while max(chain[-1].shape[:2]) > 1:
         chain.append(_with_distance(halved(_with_share(chain[-1]))))
     return chain, exact
-
-
-def _half_size(picture: F32) -> tuple[int, int]:
-    return max(1, picture.shape[0] // 2), max(1, picture.shape[1] // 2)
 
 
 def _arranged(faces: F32, layout: str) -> F32:

@@ -82,7 +82,9 @@ def fit(points: F64, triangles: NDArray[np.integer]) -> Fit:
         parts = [parts[int(place)] for place in np.linspace(0, len(parts) - 1, _PARTS)]
     volumes = [signed_volume(points, part) for part in parts]
     largest = max(volumes, key=abs)
-    if len(parts) > 1 and any(_inside(points, a, points, b) for a, b in _cavities(parts, volumes, largest)):
+    outer = parts[volumes.index(largest)]
+    turned = [part for part, volume in zip(parts, volumes, strict=True) if volume * largest < 0.0]
+    if any(_inside(points, part, outer) for part in turned):
         side = _smallest_side(points[np.unique(corners)])
         return Fit(_WALL, side, True, False, "hollow: a shell inside a shell")
     return together([_fit_part(points, part) for part in parts])
@@ -97,7 +99,8 @@ def together(fits: Sequence[Fit]) -> Fit:
     closed, convex = all(one.closed for one in fits), all(one.convex for one in fits)
     if len(models) == 1:
         whys = list(dict.fromkeys(one.why for one in fits))
-        why = whys[0] if len(whys) == 1 else f"{len(fits)} shapes, the worst of which: {_worst(fits)}"
+        worst = max(whys, key=lambda why: (len(why), why))
+        why = worst if len(whys) == 1 else f"{len(fits)} shapes, the worst of which: {worst}"
         return Fit(fits[0].model, thickness, closed, convex, why)
     counts = {model: sum(one.model is model for one in fits) for model in sorted(models)}
     named = ", ".join(f"{count} {model.token}" for model, count in counts.items())
@@ -107,10 +110,6 @@ def together(fits: Sequence[Fit]) -> Fit:
 def alike(thicknesses: Sequence[float]) -> bool:
     """All of them may be written as one number."""
     return not thicknesses or max(thicknesses) - min(thicknesses) <= SAME_THICKNESS * max(thicknesses)
-
-
-def _worst(fits: Sequence[Fit]) -> str:
-    return max((one.why for one in fits), key=lambda why: (len(why), why))
 
 
 # --- topology -------------------------------------------------------------------------------------------------------
@@ -159,15 +158,9 @@ def _parts(corners: Index, count: int) -> list[Index]:
     return np.split(corners[order], cuts)
 
 
-def _cavities(parts: list[Index], volumes: list[float], largest: float) -> list[tuple[Index, Index]]:
-    """Pairs of a part that is turned against the largest one, and that largest part."""
-    outer = parts[volumes.index(largest)]
-    return [(part, outer) for part, volume in zip(parts, volumes, strict=True) if volume * largest < 0.0]
-
-
-def _inside(inner_points: F64, inner: Index, outer_points: F64, outer: Index) -> bool:
+def _inside(points: F64, inner: Index, outer: Index) -> bool:
     """By bounding boxes: the first part lies within the second."""
-    a, b = inner_points[inner.ravel()], outer_points[outer.ravel()]
+    a, b = points[inner.ravel()], points[outer.ravel()]
     return bool((a.min(axis=0) >= b.min(axis=0)).all() and (a.max(axis=0) <= b.max(axis=0)).all())
 
 

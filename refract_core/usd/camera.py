@@ -14,7 +14,6 @@ FOCAL_LENGTH = 50.0
 APERTURE = (20.955, 15.2908)
 """Horizontal and vertical [tenths of a scene unit]; fallbacks of UsdGeomCamera."""
 MAIN_CAMERA = "main_cam"
-_TENTH = 0.1
 
 
 def read_cameras(
@@ -64,7 +63,7 @@ def _read(
         for attribute in (camera.GetHorizontalApertureOffsetAttr(), camera.GetVerticalApertureOffsetAttr())
     ]
     # An orthographic aperture is a length in the scene: tenths of a unit.
-    unit = _TENTH * metres_per_unit if orthographic else 1.0 / focal
+    unit = 0.1 * metres_per_unit if orthographic else 1.0 / focal
     return Camera(
         path=path,
         world_from_camera=pose,

@@ -173,6 +173,7 @@ def _read(
     }
     cameras = choose_camera(stage, time, read_cameras(stage, time, **frame), camera, bounds, notices)
     lights, environment = read_lights(stage, time, purposes=purposes, **frame)
+    every = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
     return Scene(
         meshes=meshes,
         materials=tuple(tables.materials),
@@ -180,7 +181,7 @@ def _read(
         textures=tuple(tables.textures.values()),
         lights=lights,
         environment=environment,
-        camera_light=not _has_light(stage),
+        camera_light=not any(prim.HasAPI(UsdLux.LightAPI) for prim in every),
         cameras=cameras,
         probes=read_probes(stage, time, read_cubemap=read_cubemap, **frame),
         bounds=bounds,
@@ -202,10 +203,6 @@ def _drawn(placed: list[Placed], centre: F64) -> tuple[tuple[Mesh, ...], tuple[S
         else:
             meshes.append(to_mesh(item, centre))
     return tuple(reversed(meshes)), tuple(reversed(spheres))
-
-
-def _has_light(stage: Usd.Stage) -> bool:
-    return any(prim.HasAPI(UsdLux.LightAPI) for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
 
 
 def stage_unit(stage: Usd.Stage, notices: list[Notice]) -> float:

@@ -21,7 +21,6 @@ Mask = NDArray[np.bool_]
 
 PIXELS_PER_DEGREE = 0.7 * 3840 / 0.7 * math.pi / 180.0
 """A 4K monitor, 0.7 m wide, seen from 0.7 m: what FLIP assumes (Andersson et al. 2020)."""
-_EXTRA = "FLIP needs the package 'flip-evaluator'; pip install 'usd-refract[bench]'"
 
 
 def displayed(linear: Picture) -> F32:
@@ -70,7 +69,7 @@ def flip_map(test: Picture, truth: Picture, pixels_per_degree: float = PIXELS_PE
     try:
         import flip_evaluator
     except ImportError as error:
-        raise UsageError(_EXTRA) from error
+        raise UsageError("FLIP needs the package 'flip-evaluator'; pip install 'usd-refract[bench]'") from error
     pair = [np.ascontiguousarray(picture, np.float32) for picture in (truth, test)]
     found, _, _ = flip_evaluator.evaluate(
         *pair, "LDR", applyMagma=False, computeMeanError=False, parameters={"ppd": pixels_per_degree}

@@ -17,7 +17,6 @@ from ..optics.arrays import refract_node
 
 MODES = ("safe", "critical")
 SWEEP_STEPS = 18
-_BAR = 40  # characters of a full bar
 
 F64 = NDArray[np.float64]
 
@@ -143,7 +142,7 @@ def sweep_text(found: list[Answer]) -> str:
     rows = ["  angle  refracted  deviation  intensity  reflectance"]
     for one in found:
         bent = "    total" if one.refracted_angle is None else f"{one.refracted_angle:9.3f}"
-        bar = "#" * round(_BAR * one.reflectance)
+        bar = "#" * round(40 * one.reflectance)
         row = f"{one.angle:7.2f}  {bent}  {one.deviation:9.3f}  {one.intensity:9.5f}  {one.reflectance:11.5f}  {bar}"
         rows.append(row.rstrip())
     return "\n".join(rows)

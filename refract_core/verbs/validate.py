@@ -141,7 +141,7 @@ def to_text(verdict: Verdict) -> str:
     subject = verdict.fixed_in or verdict.stage
     lines += list(_listed(verdict.findings, subject, fixing=not verdict.fixed_in))
     counts = Counter(finding.severity for finding in verdict.findings)
-    said = ", ".join(_count(counts[severity], severity) for severity in SEVERITIES)
+    said = ", ".join(f"{counts[severity]} {severity}{'' if counts[severity] == 1 else 's'}" for severity in SEVERITIES)
     lines.append(f"{subject}: {said}" if verdict.findings else f"{subject}: nothing to complain about")
     return "\n".join(lines)
 
@@ -160,7 +160,3 @@ def _listed(findings: Iterable[Finding], stage: str, *, fixing: bool) -> Iterato
             yield f"         fix: {fix_of(finding, stage)}{safe}"
         if shown[finding.rule] == _SHOWN < every[finding.rule]:
             yield f"         ... and {every[finding.rule] - _SHOWN} more of {finding.rule}; --json lists all"
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"

@@ -100,7 +100,7 @@ def add(layer: Sdf.Layer, additions: Iterable[Addition]) -> None:
             if addition.applies:
                 apply_api(spec, API)
             for name, value in addition.values.items():
-                _attribute(spec, name).default = _typed(name, value)
+                _attribute(spec, name).default = Gf.Vec3f(*value) if isinstance(value, tuple) else value
             for name, source in addition.connections.items():
                 _attribute(spec, name).connectionPathList.explicitItems = [Sdf.Path(source)]
 
@@ -114,8 +114,3 @@ def _attribute(spec: Sdf.PrimSpec, name: str) -> Sdf.AttributeSpec:
     if name.startswith("primvars:"):
         attribute.SetInfo("interpolation", UsdGeom.Tokens.constant)
     return attribute
-
-
-def _typed(name: str, value: Any) -> Any:
-    kind = _TYPES[name]
-    return Gf.Vec3f(*value) if kind == Sdf.ValueTypeNames.Color3f else value

@@ -275,13 +275,11 @@ def _band_st(pair: F64, height: F64, *, disc: bool) -> F64:
     return np.stack((0.5 + 0.5 * x, 0.5 + 0.5 * facing * y), axis=2).reshape(-1, 2)
 
 
-_QUAD_ST = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
-
-
 def _quads(points: F64, loops: Index) -> tuple[F32, U32, Corners]:
     split = np.array([[0, 1, 2], [0, 2, 3]])
     triangles = loops[:, split].reshape(-1, 3).astype(np.uint32)
-    return points.astype(np.float32), triangles, Corners(_QUAD_ST, np.tile(split, (len(loops), 1)))
+    st = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+    return points.astype(np.float32), triangles, Corners(st, np.tile(split, (len(loops), 1)))
 
 
 @lru_cache(maxsize=1)

@@ -20,7 +20,6 @@ MAX_PRIMS = 4_000_000
 """Prims looked at, native instances expanded."""
 
 DRAWN = frozenset({"Mesh", *ATTRIBUTES})
-_EVERYTHING = Usd.TraverseInstanceProxies()
 # Prototypes of a point instancer are often `over` or `class` prims, so that nothing else draws them.
 _PROTOTYPES = Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)
 _INSTANCER_ATTRIBUTES = ("protoIndices", "positions", "orientations", "orientationsf", "scales", "invisibleIds")
@@ -71,7 +70,7 @@ def walk(stage: Usd.Stage, time: Usd.TimeCode, purposes: tuple[str, ...], notice
     """
     state = _Walk(time, frozenset(purposes), notices, UsdGeom.XformCache(time))
     start = _Node(stage.GetPseudoRoot(), Gf.Matrix4d(1.0), UsdGeom.Imageable.PurposeInfo(), True)
-    found = list(_descend(state, start, _EVERYTHING, 0))
+    found = list(_descend(state, start, Usd.TraverseInstanceProxies(), 0))
     for kind, paths in sorted(state.unsupported.items()):
         notices.append(Notice(paths[0], f"{kind} is not rendered; convert it to a Mesh ({some_of(paths)})"))
     if state.drawn_otherwise:

@@ -13,7 +13,6 @@ from ...scene import F64, Environment, Light, LightKind, Notice
 from .domes import Dome, read_dome, rotation, sum_domes
 
 _DOMES = ("DomeLight", "DomeLight_1")
-_KELVIN = (1000.0, 10000.0)
 
 
 class Context(NamedTuple):
@@ -85,7 +84,7 @@ def _read_light(context: Context, prim: Usd.Prim, lights: list[Light], domes: li
     if emission is None:
         return
     _note_ignored(context, prim)
-    world_from_light = context.engine_from_stage @ _column(context.xforms.GetLocalToWorldTransform(prim))
+    world_from_light = context.engine_from_stage @ np.array(context.xforms.GetLocalToWorldTransform(prim), np.float64).T
     if not np.isfinite(world_from_light).all():
         _note(context, prim, "has a transform with NaN or infinity; the light is skipped; repair its xformOps")
         return
@@ -116,11 +115,6 @@ def _read_light(context: Context, prim: Usd.Prim, lights: list[Light], domes: li
 
 def _note(context: Context, prim: Usd.Prim, text: str) -> None:
     context.notices.append(Notice(str(prim.GetPath()), text))
-
-
-def _column(matrix: Any) -> F64:
-    """A Gf row-vector matrix as a numpy matrix for column vectors."""
-    return np.array(matrix, np.float64).T
 
 
 def _shown(prim: Usd.Prim, time: Usd.TimeCode, purposes: tuple[str, ...]) -> bool:
@@ -169,7 +163,7 @@ def _temperature(context: Context, prim: Usd.Prim) -> F64:
     if not _value(context, prim, "inputs:enableColorTemperature", False):
         return np.ones(3)
     kelvin = float(_value(context, prim, "inputs:colorTemperature", 6500.0))
-    low, high = _KELVIN
+    low, high = 1000.0, 10000.0  # as UsdLux has it
     if not low <= kelvin <= high:  # usd-core 26.11 crashes on NaN
         used = min(max(kelvin, low), high) if math.isfinite(kelvin) else 6500.0
         _note(context, prim, f"inputs:colorTemperature is {kelvin}; the valid range is {low:g} to {high:g} K; "

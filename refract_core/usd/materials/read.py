@@ -104,7 +104,7 @@ def read_surface(context: Context, material: UsdShade.Material, unit: float) -> 
         shader = material.ComputeSurfaceSource(render_context)[0]
         if shader and shader.GetPath() not in [known.GetPath() for known in found]:
             found.append(shader)
-    known = [shader for shader in found if _is_known(shader)] or vendor_surfaces(material)
+    known = [shader for shader in found if shader.GetShaderId() in (*_PREVIEW, *READERS)] or vendor_surfaces(material)
     for position, shader in enumerate(known):
         trial = context._replace(textures=dict(context.textures), notices=list(context.notices), unsupported=[])
         surface = _read_shader(trial, shader, unit)
@@ -116,10 +116,6 @@ def read_surface(context: Context, material: UsdShade.Material, unit: float) -> 
         note(context, f"{node_name(shader)} needs nodes that are not supported ({', '.join(trial.unsupported)}); "
              f"{node_name(known[position + 1])} of the same material is used")  # fmt: skip
     return _unknown_surface(context, material, found), None
-
-
-def _is_known(shader: UsdShade.Shader) -> bool:
-    return shader.GetShaderId() in _PREVIEW or shader.GetShaderId() in READERS
 
 
 def vendor_surfaces(material: UsdShade.Material) -> list[UsdShade.Shader]:

@@ -111,7 +111,7 @@ def lowest(source: Source, textures: dict[str, Texture]) -> float:
 def read_preview_surface(context: Context, shader: UsdShade.Shader) -> Surface:
     """UsdPreviewSurface, or its MaterialX twin, with every input."""
     inputs = {p: read_source(context, shader.GetInput(name), DEFAULTS[p]) for name, p in _INPUTS.items()}
-    inputs = {param: clamped(context, param, source, f"inputs:{_name(param)}") for param, source in inputs.items()}
+    inputs |= {p: clamped(context, p, inputs[p], f"inputs:{name}") for name, p in _INPUTS.items()}
     _check_normal(context, inputs)
     if _authored(shader, "displacement") and not _zero(context, shader, "displacement"):
         note(context, "displacement is ignored; tessellate and displace the mesh beforehand if its shape matters")
@@ -138,10 +138,6 @@ def display_color_inputs(*, has_opacity: bool) -> dict[Param, Source]:
     if has_opacity:
         inputs[Param.OPACITY] = replace(constant(1.0), primvar="displayOpacity")
     return inputs
-
-
-def _name(param: Param) -> str:
-    return next(name for name, known in _INPUTS.items() if known is param)
 
 
 def _authored(shader: UsdShade.Shader, name: str) -> bool:

@@ -10,7 +10,6 @@ from ...errors import ImageError
 from ...scene import Texture
 
 COLOR_SPACES = ("auto", "raw", "sRGB")
-_UDIM = "<UDIM>"
 
 
 def resolve_asset(attribute: Usd.Attribute, time: Usd.TimeCode) -> str:
@@ -49,7 +48,7 @@ def read_texture(path: str, color_space: str) -> Texture:
 
     if color_space not in COLOR_SPACES:
         raise ImageError(f"{path}: colour space '{color_space}' is not one of {', '.join(COLOR_SPACES)}")
-    if _UDIM in path:
+    if "<UDIM>" in path:
         raise ImageError(f"{path}: UDIM tiles are not read; name a single image file")
     name = texture_key(path, color_space)
     return decode(file_of(path), name=name, color_space=color_space)

@@ -24,8 +24,6 @@ from .probes import probe_findings, texture_state
 from .stage import UNREADABLE, glass_found, reader_findings, scenes_of
 from .values import fallback_findings, readable, value_findings
 
-_EMPTY = "nothing is visible"
-
 
 class Overview(NamedTuple):
     """A stage as it was found."""
@@ -96,7 +94,9 @@ def overview_of(path: str) -> Overview:
         typed=frozenset(name for name in materials if _is_typed(stage, name)),
         states={probe.path: texture_state(other, probe, scene_at) for probe in scene.probes},
         # Without glass the reader is left with nothing, and says so; that is only true where nothing else is drawn.
-        unsupported=reader_findings([n for n in scene.notices if not (drawn and n.text.startswith(_EMPTY))], found),
+        unsupported=reader_findings(
+            [notice for notice in scene.notices if not (drawn and notice.text.startswith("nothing is visible"))], found
+        ),
         suspicious=found,
     )
 
