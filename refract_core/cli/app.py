@@ -64,6 +64,7 @@ def refract(version: Version = False) -> None:
 
 
 def words(text: str) -> tuple[str, ...]:
+    """The parts of a comma-separated option, without empty ones."""
     return tuple(word.strip() for word in text.split(",") if word.strip())
 
 

@@ -96,6 +96,7 @@ _HEAD = ("material", "from", "model", "ior", "thickness", "colour", "distance", 
 
 
 def _as_table(order: ConvertOrder, rows: tuple[Row, ...]) -> str:
+    """One line for each material, its notes below it, and what became of all."""
     if not rows:
         return f"{order.out}: written; no glass was found in {order.stage}"
     cells = [_HEAD, *(_cells(row) for row in rows)]

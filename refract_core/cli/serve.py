@@ -124,6 +124,7 @@ def _numbers(given: list[str]) -> dict[str, int | None]:
 
 
 def _tokens(path: str) -> tuple[str, ...]:
+    """The tokens of a file, one a line; lines that begin with # are for people. Raises UsageError."""
     if not path:
         return ()
     try:

@@ -24,6 +24,7 @@ STRAIGHT_ALPHA = "oiio:UnassociatedAlpha"
 
 
 def extension_of(path: str) -> str:
+    """`.exr` of `Shot.EXR`: the part that chooses a format."""
     return os.path.splitext(path)[1].lower()
 
 
@@ -125,6 +126,7 @@ def _display_window(pixels: NDArray[Any], spec: Any) -> NDArray[Any]:
 
 
 def _rgba(pixels: NDArray[Any], spec: Any) -> NDArray[Any]:
+    """Four channels out of however many the file has, found by their names where it names them."""
     names = list(spec.channelnames)
     count = spec.nchannels
     alpha = spec.alpha_channel

@@ -194,6 +194,7 @@ def _bilinear(planes: F32, plane: NDArray[np.intp], x: F64, y: F64) -> F32:
 
 
 def _from_latlong(pixels: F32, resolution: int) -> F32:
+    """Faces as means over each texel's area: rows of rays through it, each a bilinear lookup."""
     pixels = np.asarray(pixels, np.float32)
     while pixels.shape[1] > _FINEST * resolution and pixels.shape[0] % 2 == 0:
         pixels = halved(pixels)

@@ -155,6 +155,7 @@ def _extension(path: str) -> str:
 
 
 def _exr(planes: Mapping[str, F32], metadata: Mapping[str, str | float], height: int, width: int) -> tuple[F32, Any]:
+    """Planes side by side as the channels of one EXR, and OpenImageIO's description of it."""
     names: list[str] = []
     formats: list[str] = []
     columns: list[F32] = []
@@ -172,6 +173,7 @@ def _exr(planes: Mapping[str, F32], metadata: Mapping[str, str | float], height:
 def _eight_bit(
     path: str, name: str, plane: F32, metadata: Mapping[str, str | float], color_correction: str
 ) -> tuple[NDArray[np.uint8], Any]:
+    """One plane as 8 bits, and OpenImageIO's description of the file."""
     import OpenImageIO as oiio
 
     extension = _extension(path)
@@ -221,6 +223,7 @@ def display(name: str, plane: F32, color_correction: str = "sRGB") -> NDArray[np
 
 
 def _corrected(rgb: F32, color_correction: str) -> F32:
+    """Colours as a screen takes them, shape (H, W, 3). Raises UsageError where OpenColorIO has no view."""
     if color_correction == "disabled":
         return rgb
     if color_correction == "sRGB":

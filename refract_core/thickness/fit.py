@@ -184,6 +184,7 @@ class _Surface:
 
 
 def _surface(points: F64, corners: Index) -> _Surface:
+    """A closed part about its own middle, turned outwards, without triangles of no area."""
     used, number = np.unique(corners, return_inverse=True)
     corners = number.reshape(-1, 3)
     points = points[used] - points[used].mean(axis=0)
@@ -199,6 +200,7 @@ def _surface(points: F64, corners: Index) -> _Surface:
 
 
 def _fit_part(points: F64, corners: Index) -> Fit:
+    """What suits one closed part: convex ones may be balls or boxes, others hollow."""
     part = _surface(points, corners)
     if not len(part.corners):
         return Fit(_WALL, 0.0, True, False, "closed, but without a volume")

@@ -49,6 +49,7 @@ def _read(
     metres_per_unit: float,
     notices: list[Notice],
 ) -> Camera | None:
+    """One camera in engine world; None, and a notice, where its transform gives no pose."""
     path = str(camera.GetPath())
     pose = _rigid(matrix, engine_from_stage)
     if pose is None:
@@ -158,6 +159,7 @@ def choose_camera(
 
 
 def _choose(stage: Usd.Stage, cameras: tuple[Camera, ...], wanted: str, notices: list[Notice]) -> Camera | None:
+    """The camera asked for, else that of the render settings, the main one, the first; None where there is none."""
     if wanted:
         return _asked_for(cameras, wanted, notices)
     settings = UsdRender.Settings.GetStageRenderSettings(stage)

@@ -60,6 +60,7 @@ def read_settings(stage: Usd.Stage, prim_path: str = "", notices: list[Notice] |
 
 
 def _settings_prim(stage: Usd.Stage, prim_path: str) -> Usd.Prim | None:
+    """The prim asked for, else the one the stage names, if any. Raises StageError where it is none."""
     where, path = FLAG, prim_path
     if not prim_path:
         where, path = "the stage's renderSettingsPrimPath", str(stage.GetMetadata("renderSettingsPrimPath") or "")

@@ -152,6 +152,7 @@ def _read(
     stage: Usd.Stage, time: Usd.TimeCode, purposes: tuple[str, ...], camera: str, notices: list[Notice],
     keep: Keep | None,
 ) -> Scene:  # fmt: skip
+    """Everything of a stage in engine world, whose origin is the middle of what is drawn."""
     metres_per_unit = stage_unit(stage, notices)
     metres_from_stage = _upright(stage, notices) @ np.diag([metres_per_unit] * 3 + [1.0])
     tables = Tables(time, metres_per_unit, notices)
@@ -249,6 +250,7 @@ def _placed(placements: list[Placement], metres_from_stage: F64, tables: Tables)
 
 
 def _part(prim: Usd.Prim, bound: Bound, shapes: dict[Sdf.Path, Shape | None], tables: Tables) -> Part | None:
+    """A prim's shape and materials; None, and a notice, where USD cannot read it."""
     # Proxies of one native prototype share its geometry; inherited materials and primvars may differ.
     shared = prim.IsInstanceProxy()
     key = prim.GetPrimInPrototype().GetPath() if shared else prim.GetPath()

@@ -64,6 +64,7 @@ def parse_frames(frames: str) -> list[float]:
 
 
 def _range(spec: str) -> list[float]:
+    """Time codes of one frame spec. Raises UsageError."""
     if _SPEC.fullmatch(spec) is None:
         raise UsageError(_malformed(spec))
     try:

@@ -18,10 +18,12 @@ def numbers(value: Any) -> tuple[float, ...] | None:
 
 
 def finite(values: Iterable[float]) -> bool:
+    """None of them is NaN or infinite."""
     return all(math.isfinite(value) for value in values)
 
 
 def triple(vector: Iterable[Any]) -> tuple[float, float, float]:
+    """A vector of any library as three plain floats."""
     x, y, z = (float(part) for part in vector)
     return x, y, z
 

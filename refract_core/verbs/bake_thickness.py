@@ -169,6 +169,7 @@ def bake_over(
 
 
 def _tell(report: Report, found: Found, work: Work, lost: Iterable[Notice]) -> None:
+    """What was left alone and why, what comes in the way of what was written, and what was measured."""
     for notice in (*work.left, *lost):
         report.warning(notice.path, notice.text)
     for path in work.fixed:
@@ -254,6 +255,7 @@ def _row(candidate: Candidate, values: F64 | F32, how: str, notes: list[str]) ->
 
 
 def _advice(candidate: Candidate, how: How) -> Iterator[str]:
+    """What a person should know of a prim's glass before trusting the numbers."""
     for coat in candidate.coats:
         if coat.multiplier != 1.0:
             yield (

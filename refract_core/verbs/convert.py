@@ -259,6 +259,7 @@ def _absorption(
 
 
 def _additions(glass: Glass, row: Row, per_prim: dict[str, float]) -> Iterable[Addition]:
+    """What is authored on the material, and on single prims that need another thickness."""
     values: dict[str, Any] = {"refraction:model": row.model, "inputs:refraction:ior": row.ior}
     connections: dict[str, str] = {}
     if row.color != (1.0, 1.0, 1.0) or row.color_from:

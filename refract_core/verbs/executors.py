@@ -358,6 +358,7 @@ def _perform(function: Callable[[Bench, Any], Any], sent: Sent, shared: bytes | 
 
 
 def _opened(sent: Sent, shared: bytes | None, here: Desk) -> _Opened | None:
+    """The stage of an order: open already, opened where it lies, or out of the bytes; None where they are needed."""
     from ..usd.stage import open_stage
 
     if sent.order in _open:

@@ -107,6 +107,7 @@ def _cameras(cameras: Sequence[Camera]) -> list[Report]:
 
 
 def _glass(piece: Glass, seen: Overview, inside: list[tuple[str, float]], layers: int | None) -> Report:
+    """One piece of glass as JSON has it."""
     reached = [{"path": path, "share": round(part, 3)} for path, part in inside if part > 0.0]
     thickness = piece.thickness
     how = "default" if thickness.how == "typed" and piece.row.name not in seen.typed else thickness.how
@@ -143,6 +144,7 @@ def _tiers(seen: Overview, reached: bool) -> list[str]:
 
 
 def _probes(seen: Overview, shares: list[list[tuple[str, float]]]) -> list[Report]:
+    """The probes as JSON has them."""
     return [
         {
             "path": probe.path,
@@ -246,6 +248,7 @@ def to_text(report: Report) -> str:
 
 
 def _head(report: Report) -> list[str]:
+    """The lines about the stage as a whole."""
     unit, time, prims = report["metres_per_unit"], report["time"], report["prims"]
     guess = "" if report["metres_per_unit_authored"] else " (metersPerUnit is not authored)"
     start, end = time["start"], time["end"]
@@ -275,6 +278,7 @@ _HEADINGS = ("  prim", "model", "ior", "thickness [m]", "shape", "layers", "tier
 
 
 def _row(piece: Report) -> tuple[str, ...]:
+    """The cells of one piece of glass, under `_HEADINGS`."""
     ior, thickness = piece["ior"], piece["thickness"]
     least, most = thickness["least"], thickness["most"]
     amount = f"{most:.4g}" if least == most else f"{least:.3g}..{most:.3g}"

@@ -137,6 +137,7 @@ def _close(scene: Scene, path: str) -> str:
 
 
 def _overridden(material: Material, changes: Mapping[str, Any], unit: float) -> Material:
+    """A material with other values. `unit`: metres per scene unit."""
     inputs = list(material.inputs)
     given = {field: value for field, value in changes.items() if value is not None}
     for field, param in _PARAMS.items():

@@ -107,6 +107,7 @@ class _Picture(NamedTuple):
 def _render_jobs(
     order: Order, jobs: Sequence[Any], report: Report, cancel: Callable[[], bool], crew: Crew | None
 ) -> None:
+    """Read what holds for all frames, and draw them here or elsewhere. Each notice is told once."""
     from ..usd.settings import read_settings
     from ..usd.stage import open_stage
 

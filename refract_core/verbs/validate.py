@@ -147,6 +147,7 @@ def to_text(verdict: Verdict) -> str:
 
 
 def _listed(findings: Iterable[Finding], stage: str, *, fixing: bool) -> Iterator[str]:
+    """Lines of the findings, the first few of each rule."""
     shown: Counter[str] = Counter()
     every = Counter(finding.rule for finding in findings)
     for finding in findings:

@@ -81,6 +81,7 @@ def original(prim: Usd.Prim) -> Sdf.Path:
 
 
 def _read(prim: Usd.Prim, time: Usd.TimeCode, unit: float, textures: dict[str, Texture]) -> Glass | None:
+    """What one material says; None where it lets no light through."""
     material = UsdShade.Material(prim)
     if not has_api(prim) and not _may_transmit(material):
         return None

@@ -87,6 +87,8 @@ class Primitive:
 
 @dataclass(frozen=True)
 class Node:
+    """A place in the hierarchy, with a mesh (-1: none) and what hangs below it."""
+
     name: str
     matrix: F64
     """shape (4, 4), column vectors: parent from node"""
@@ -145,6 +147,7 @@ class _File:
 
 
 def _read(file: _File) -> Gltf:
+    """The parts of a parsed file. Raises ValueError or LookupError where it refers to what is not there."""
     document = file.document
     left = {"skins": document.skins, "animations": document.animations, "cameras": document.cameras}
     if found := [name for name, values in left.items() if values]:
@@ -172,6 +175,7 @@ def _say(file: _File, text: str) -> None:
 
 
 def _uri(file: _File, uri: str) -> bytes:
+    """The bytes a URI stands for: its own, or a file beside the glTF file. Nothing is fetched. Raises StageError."""
     if uri.startswith("data:"):
         found: bytes = file.document.decode_data_uri(uri)
         return found
@@ -248,6 +252,7 @@ def _primitives(file: _File, mesh: Any) -> tuple[Primitive, ...]:
 
 
 def _primitive(file: _File, primitive: Any) -> Primitive:
+    """Triangles with their attributes; those that name a point that is not there are left out."""
     attributes = primitive.attributes
     points = _accessor(file, attributes.POSITION).astype(np.float32)
     corners = np.arange(len(points)) if primitive.indices is None else _accessor(file, primitive.indices)[:, 0]
@@ -268,6 +273,7 @@ def _primitive(file: _File, primitive: Any) -> Primitive:
 
 
 def _material(file: _File, material: Any, number: int) -> GltfMaterial:
+    """Core factors, the KHR extensions that the renderer or its schema has a place for, and the pictures."""
     core, extensions = material.pbrMetallicRoughness, material.extensions or {}
     values: dict[str, Any] = {}
     pictures: dict[str, Picture] = {}
@@ -334,6 +340,7 @@ def _picture(file: _File, info: Any) -> Picture:
 
 
 def _image(file: _File, number: int) -> tuple[str, bytes]:
+    """A picture's extension and bytes; two times nothing, and a notice, where it cannot be used."""
     image = file.document.images[number]
     try:
         content = _uri(file, image.uri) if image.uri else _view(file, image.bufferView)[0]
@@ -370,6 +377,7 @@ def _triangles(corners: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
 
 
 def _node(node: Any, number: int) -> Node:
+    """A node whose matrix is composed where the file gives translation, rotation and scale."""
     matrix = np.eye(4)
     if node.matrix:
         matrix = np.array(node.matrix, np.float64).reshape(4, 4).T

@@ -44,6 +44,7 @@ def begin(path: str, pictures: str) -> tuple[Work, list[Glass], dict[str, bytes]
 
 
 def _build(path: str, gltf: Gltf, pictures: str) -> tuple[Work, list[Glass], dict[str, bytes]]:
+    """The stage in memory, its glass, and its pictures by path."""
     layer = Sdf.Layer.CreateAnonymous("gltf.usda")
     stage = Usd.Stage.Open(layer)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
@@ -120,6 +121,7 @@ def _node(
 def _mesh(
     stage: Usd.Stage, path: Sdf.Path, primitive: Primitive, gltf: Gltf, materials: list[UsdShade.Material]
 ) -> None:
+    """One primitive as a Mesh of triangles, v turned upwards, bound to its material."""
     mesh = UsdGeom.Mesh.Define(stage, path)
     points = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(primitive.points))
     mesh.CreatePointsAttr(points)

@@ -67,6 +67,7 @@ def write_surfaces(layer: Sdf.Layer, target: str, paths: Iterable[str]) -> dict[
 
 
 def _write(material: UsdShade.Material, record: Material, target: _Target, unit: float) -> Iterable[str]:
+    """One material's surface; tells what was done, or why nothing."""
     where = f"outputs:{target.context + ':' if target.context else ''}surface"
     place = editable(material.GetPrim())
     if record.model is Model.NONE or place is None:
@@ -199,6 +200,7 @@ def _preview(record: Material, unit: float) -> tuple[_Inputs, _Inputs]:
 
 
 def _open_pbr(record: Material, unit: float) -> tuple[_Inputs, _Inputs]:
+    """What makes it glass in OpenPBR 1.1, and what else it may have."""
     thin = record.model.behind is Behind.SHEET
     glass: _Inputs = {
         "transmission_weight": neat(1.0 - _one(record, Param.OPACITY)),
@@ -221,6 +223,7 @@ def _open_pbr(record: Material, unit: float) -> tuple[_Inputs, _Inputs]:
 
 
 def _gltf(record: Material, unit: float) -> tuple[_Inputs, _Inputs]:
+    """What makes it glass in glTF PBR, and what else it may have."""
     thin = record.model.behind is Behind.SHEET
     tint = _three(record.inputs[Param.TRANSMITTANCE])
     glass: _Inputs = {

@@ -39,6 +39,8 @@ class Bound(NamedTuple):
 
 
 class Part(NamedTuple):
+    """A prim's shape with its materials and the primvars they read, before it is put anywhere."""
+
     shape: Shape
     materials: I32
     """shape (T,)"""
@@ -104,6 +106,7 @@ def _primvars_of(material: Material) -> frozenset[str]:
 
 
 def _triangle_materials(prim: Usd.Prim, shape: Shape, bound: Bound, tables: Tables) -> I32:
+    """Row of the material table for each triangle, shape (T,): by GeomSubset, else by the prim."""
     if shape.topology is None or not bound.subsets:
         number = _material_number(prim, shape, bound.material, tables)
         return np.full(len(shape.triangles), number, np.int32)
@@ -119,6 +122,7 @@ def _triangle_materials(prim: Usd.Prim, shape: Shape, bound: Bound, tables: Tabl
 
 
 def _subset_faces(subset: UsdGeom.Subset, face_count: int, tables: Tables) -> I32:
+    """Faces of a subset that the mesh has; a notice tells of the others."""
     path = str(subset.GetPath())
     kind = subset.GetElementTypeAttr().Get(tables.time)
     if kind != UsdGeom.Tokens.face:

@@ -67,6 +67,7 @@ def _varies(prim: Usd.Prim, names: tuple[str, ...]) -> bool:
 
 
 def _read_gprim(prim: Usd.Prim, time: Usd.TimeCode) -> Shape:
+    """A sphere, cube, cone ... as triangles, exactly a sphere where it is one."""
     gprim = gprims.read_gprim(prim, time)
     return Shape(
         points=gprim.solid.points,
@@ -134,6 +135,7 @@ def _topology(count_bytes: bytes, index_bytes: bytes) -> _Topology | None:
 
 
 def _read_mesh(mesh: UsdGeom.Mesh, time: Usd.TimeCode, notices: list[Notice]) -> Shape:
+    """A Mesh as triangles; faces that cannot be used are left out with a notice."""
     faces = _usable_faces(mesh, time)
     cut = _cut(faces, str(mesh.GetPath()), notices)
     left_handed = mesh.GetOrientationAttr().Get(time) == UsdGeom.Tokens.leftHanded

@@ -49,6 +49,8 @@ class _Node(NamedTuple):
 
 @dataclass
 class _Walk:
+    """What one walk through a stage knows and gathers."""
+
     time: Usd.TimeCode
     purposes: frozenset[str]
     notices: list[Notice]

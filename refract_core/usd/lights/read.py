@@ -160,6 +160,7 @@ def _emission(context: Context, light: UsdLux.LightAPI) -> tuple[float, float, f
 
 
 def _temperature(context: Context, prim: Usd.Prim) -> F64:
+    """Colour of a black body [linear BT.709], shape (3,), 1 where the light does not ask for one."""
     if not _value(context, prim, "inputs:enableColorTemperature", False):
         return np.ones(3)
     kelvin = float(_value(context, prim, "inputs:colorTemperature", 6500.0))
@@ -298,6 +299,7 @@ def _note_ignored(context: Context, prim: Usd.Prim) -> None:
 
 
 def _ignored_shaping(context: Context, prim: Usd.Prim) -> list[str]:
+    """Names of what shapes a light elsewhere and is authored here."""
     found = []
     row = ROWS.get(str(prim.GetTypeName()))
     if float(_value(context, prim, "inputs:shaping:cone:angle", 180.0)) < (row.cone if row else 90.0):
@@ -311,6 +313,7 @@ def _ignored_shaping(context: Context, prim: Usd.Prim) -> list[str]:
 
 
 def _ignored_links(prim: Usd.Prim) -> list[str]:
+    """Names of what leaves objects or portals out elsewhere and is authored here."""
     found = []
     for name in ("lightLink", "shadowLink"):
         prefix = f"collection:{name}"
@@ -327,6 +330,7 @@ def _ignored_links(prim: Usd.Prim) -> list[str]:
 
 
 def _ignored_inputs(context: Context, prim: Usd.Prim) -> list[str]:
+    """Names of other inputs that are authored and not rendered."""
     found = []
     if _value(context, prim, "inputs:shadow:enable", True) is False:
         found.append("inputs:shadow:enable = 0")

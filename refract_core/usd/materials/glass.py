@@ -209,6 +209,7 @@ def _volume(context: Context, shader: UsdShade.Shader, naming: Naming, unit: flo
 
 
 def _note_ignored(context: Context, shader: UsdShade.Shader, naming: Naming) -> None:
+    """One notice about inputs that do something elsewhere: those not at their neutral value."""
     names = []
     for name, neutral in naming.ignored:
         attribute = producer(context, shader.GetInput(name))
@@ -233,6 +234,7 @@ def _coverage(context: Context, shader: UsdShade.Shader, naming: Naming) -> tupl
 
 
 def _read(context: Context, shader: UsdShade.Shader, naming: Naming, unit: float) -> Surface:
+    """Glass where it transmits at all (then presence is ignored), else an opaque or cut-out surface."""
     inputs = _common(context, shader, naming)
     coverage, presence, threshold = _coverage(context, shader, naming)
     transmission = scalar(_source(context, shader, naming.transmission))

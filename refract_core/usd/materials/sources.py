@@ -68,10 +68,12 @@ def shown(value: Any) -> str:
 
 
 def constant(value: Value) -> Source:
+    """A source that is the same everywhere."""
     return Source(value=four(value if isinstance(value, tuple) else (value,)))
 
 
 def is_constant(source: Source) -> bool:
+    """Neither a texture nor a primvar drives it."""
     return source.texture < 0 and not source.primvar
 
 
@@ -149,6 +151,7 @@ def read_numbers(context: Context, port: UsdShade.Input, default: tuple[float, .
 
 
 def read_number(context: Context, port: UsdShade.Input, default: float) -> float:
+    """One number, of an input that can only be constant."""
     return read_numbers(context, port, (default,))[0]
 
 
@@ -249,6 +252,7 @@ def _picked(value: Four, channel: Channel) -> Four:
 
 
 def _uv_texture(context: Context, shader: UsdShade.Shader, output: str, default: Value, depth: int) -> Source:
+    """A UsdUVTexture as a source: its picture, wrap, scale and bias, and the uv it is looked up at."""
     channel = _CHANNELS.get(output, Channel.RGB)
     fallback = _fallback(context, shader, (0.0, 0.0, 0.0, 1.0))
     texture = _texture_index(context, shader, _color_space(context, shader))

@@ -79,6 +79,7 @@ def token(probe: ProbePrim, name: str, allowed: tuple[str, ...]) -> str:
 
 
 def flag(probe: ProbePrim, name: str) -> bool:
+    """A truth value; the schema's own, with a notice, where it is something else."""
     value = probe.get(name)
     if isinstance(value, bool | int):
         return bool(value)

@@ -172,4 +172,5 @@ def read_asset(path: str) -> str | bytes | None:
 
 
 def is_packed(path: str) -> bool:
+    """The path leads into a package."""
     return bool(Ar.IsPackageRelativePath(path))

@@ -79,6 +79,7 @@ def glass_of(scene: Scene) -> list[Glass]:
 
 
 def _of_mesh(mesh: Mesh, number: int, scene: Scene) -> Glass:
+    """The triangles of a mesh that have one material: a body of their own only where they are all of it."""
     row = scene.materials[number]
     mine = mesh.materials == number
     points, triangles = mesh.points.astype(np.float64), mesh.triangles[mine].astype(np.int64)
@@ -113,6 +114,7 @@ def _thickness(row: Material, primvars: dict[str, NDArray[np.float32]], scene: S
 
 
 def _extent(source: Source, primvars: dict[str, NDArray[np.float32]], scene: Scene) -> tuple[str, float, float]:
+    """How a thickness is given (mapped, measured, typed), its least and its largest value [m]."""
     if source.texture >= 0:
         texture = scene.textures[source.texture]
         channel = min(int(source.channel), 3)
@@ -159,6 +161,7 @@ def glass_findings(scene: Scene, glass: list[Glass], unsure: Collection[str] = (
 
 
 def _shape(piece: Glass) -> Iterator[Finding]:
+    """The model against the shape it is on."""
     convert = "run refract convert, which chooses a model by the shape"
     model, flat = f"the {piece.model.token} model of {piece.row.name}", model_for(Behind.SLAB).token
     if piece.model.behind is Behind.MESH and not piece.closed:
@@ -210,6 +213,7 @@ def _no_uv(piece: Glass) -> Finding:
 
 
 def _inside_out(piece: Glass) -> Finding:
+    """Closed glass whose faces look inwards."""
     text = "the mesh is closed but its faces look inwards, so light enters where it should leave"
     fix = "turn its orientation attribute round, or reverse its faces"
     return INSIDE_OUT.broken(piece.path, text, fix, "orientation")

@@ -163,6 +163,7 @@ def _is_typed(stage: Usd.Stage, path: str) -> bool:
 
 
 def _counts(stage: Usd.Stage) -> dict[str, int]:
+    """How many prims of each kind, those of instances counted wherever they are drawn."""
     kinds: Counter[str] = Counter()
     for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
         kinds[str(prim.GetTypeName())] += 1

@@ -65,6 +65,7 @@ def probe_findings(stage: Usd.Stage, scene: Scene, glass: list[Glass], scene_at:
 
 
 def _picture(probe: Probe, state: str) -> Iterator[Finding]:
+    """What is wrong with a probe's picture, by its state."""
     about, bake = "probe:texture", "run refract bake probes STAGE OUT"
     if state == "missing":
         custom = probe.mode == "custom"
@@ -109,6 +110,7 @@ def _solids_at(scene: Scene, point: F64) -> Iterator[tuple[str, Callable[[F64], 
 
 
 def _outside(piece: Glass) -> Finding:
+    """Glass that no probe reaches."""
     text = "no probe's influence reaches this glass, so what the screen does not show comes from the sky"
     fix = "make a probe's influence larger, add a RefractProbe here, or render with --tiers screen,ray,sky"
     return OUTSIDE.broken(piece.path, text, fix)

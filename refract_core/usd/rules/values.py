@@ -77,6 +77,7 @@ def values_of_prim(prim: Usd.Prim) -> list[Finding]:
 
 
 def _of_prim(prim: Usd.Prim, fields: Sequence[_Field]) -> list[Finding]:
+    """At most one finding for each attribute, those that others connect to included, and the thin model's."""
     found: list[Finding] = []
     unit = stage_unit(prim.GetStage(), [])
     for field in fields:
@@ -177,6 +178,7 @@ def _shown(value: Any) -> str:
 
 
 def _wanted(field: _Field) -> str:
+    """The range of an attribute in words."""
     if field.tokens:
         single = isinstance(field.fallback, str)
         return f"{'one' if single else 'some'} of {', '.join(field.tokens)}{'' if single else ', each at most once'}"

@@ -186,6 +186,7 @@ def _coats(prim: Usd.Prim, bound: Bound, glass: frozenset[Sdf.Path], rows: _Rows
 
 
 def _coat(site: Usd.Prim, material: UsdShade.Material, row: Material, rows: _Rows) -> Coat:
+    """One material on one prim or subset, and where a layer can reach it."""
     source = row.inputs[Param.THICKNESS]
     multiplier = material.GetInput("refraction:thicknessMultiplier")
     value = multiplier.Get(rows.time) if multiplier else None
