@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from refract_core.errors import UsageError
 from refract_core.optics import arrays as optics
-from refract_core.optics import interface as optics_scalar
+from refract_core.optics import interface as scalar
 
 F64 = NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])
@@ -193,8 +193,8 @@ def test_fresnel_and_the_oracles_transmittance_sum_to_one(eta: float) -> None:
 def test_fresnel_at_outside_numbers() -> None:
     assert optics.fresnel_dielectric(1.0, 1 / GLASS) == pytest.approx(0.04, abs=1e-12)
     assert optics.fresnel_dielectric([0.0, 0.5], [1 / GLASS, GLASS]) == pytest.approx([1.0, 1.0])
-    assert optics_scalar.f0_from_ior(1.5) == pytest.approx(0.04)
-    assert optics_scalar.f0_from_ior(1.33) == pytest.approx(0.02006, abs=1e-5)
+    assert scalar.f0_from_ior(1.5) == pytest.approx(0.04)
+    assert scalar.f0_from_ior(1.33) == pytest.approx(0.02006, abs=1e-5)
 
 
 def test_brewster_angle_of_glass_reflects_only_s_polarised_light() -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from refract_core.optics import arrays as optics
-from refract_core.optics import interface as optics_scalar
+from refract_core.optics import interface as scalar
 
 UP = np.array([0.0, 0.0, 1.0])
 UNTIMED = settings(deadline=None)  # the first example may compile
@@ -74,36 +74,36 @@ def test_node_clamps_iors_and_passes_nothing_through_a_wrong_normal() -> None:
 
 def test_dispersion_of_two_catalogue_glasses() -> None:
     # Crown n_d 1.52, V 59 and diamond 2.417, V 55: n_C, n_d, n_F.
-    assert optics_scalar.channel_iors(1.52, 59.0) == pytest.approx((1.51735, 1.52, 1.52616), abs=2e-5)
-    assert optics_scalar.channel_iors(2.417, 55.0) == pytest.approx((2.40925, 2.417, 2.43501), abs=2e-5)
-    assert optics_scalar.channel_iors(1.5, 0.0) == (1.5, 1.5, 1.5)
+    assert scalar.channel_iors(1.52, 59.0) == pytest.approx((1.51735, 1.52, 1.52616), abs=2e-5)
+    assert scalar.channel_iors(2.417, 55.0) == pytest.approx((2.40925, 2.417, 2.43501), abs=2e-5)
+    assert scalar.channel_iors(1.5, 0.0) == (1.5, 1.5, 1.5)
 
 
 @UNTIMED
 @given(ior=st.floats(1.0, 3.0), abbe=st.floats(10.0, 100.0))
 def test_dispersion_keeps_the_abbe_number(ior: float, abbe: float) -> None:
-    red, green, blue = optics_scalar.channel_iors(ior, abbe)
+    red, green, blue = scalar.channel_iors(ior, abbe)
     assert green == ior
     assert 1.0 <= red <= green <= blue
     assert (blue - red) * abbe == pytest.approx(ior - 1.0, abs=1e-9)
 
 
 def test_transmitted_lobe_is_the_measured_width() -> None:
-    assert optics_scalar.transmitted_roughness(1.0, 1.5, False) == pytest.approx(0.408, abs=1e-3)
+    assert scalar.transmitted_roughness(1.0, 1.5, False) == pytest.approx(0.408, abs=1e-3)
     # alpha_t / alpha behind two interfaces of n = 1.5, from the Monte Carlo of benchmarks/lobe.py
     for roughness, ratio in ((0.1, 0.4178), (0.3, 0.4136), (0.5, 0.3872), (0.7, 0.3216)):
-        found = (optics_scalar.transmitted_roughness(roughness, 1.5, True) / roughness) ** 2
+        found = (scalar.transmitted_roughness(roughness, 1.5, True) / roughness) ** 2
         assert found == pytest.approx(ratio, rel=0.01)
     for two in (False, True):
-        assert optics_scalar.transmitted_roughness(0.7, 1.0, two) == 0.0
-        assert optics_scalar.transmitted_roughness(1.0, 4.0, two) <= 1.0
+        assert scalar.transmitted_roughness(0.7, 1.0, two) == 0.0
+        assert scalar.transmitted_roughness(1.0, 4.0, two) <= 1.0
 
 
 def test_hdrp_levels_of_the_fact_sheet() -> None:
     roughness = [0.0, 0.1, 0.25, 0.5, 0.75, 1.0]
-    probe = [optics_scalar.probe_lod_hdrp(r) for r in roughness]
+    probe = [scalar.probe_lod_hdrp(r) for r in roughness]
     assert probe == pytest.approx([0.0, 0.978, 2.2875, 4.05, 5.2875, 6.0])
-    screen = [optics_scalar.screen_lod_hdrp(r, 10) for r in roughness]
+    screen = [scalar.screen_lod_hdrp(r, 10) for r in roughness]
     assert screen == pytest.approx([0.0, 0.4511, 1.4844, 3.6551, 6.1919, 9.0], abs=1e-4)
-    assert optics_scalar.screen_lod_hdrp(0.5, 0) == 0.0
-    assert [optics_scalar.probe_roughness_hdrp(lod) for lod in probe] == pytest.approx(roughness, abs=1e-9)
+    assert scalar.screen_lod_hdrp(0.5, 0) == 0.0
+    assert [scalar.probe_roughness_hdrp(lod) for lod in probe] == pytest.approx(roughness, abs=1e-9)
