@@ -346,7 +346,7 @@ def test_a_file_that_may_not_be_whole_is_an_error(tmp_path: Path, extension: str
 import resource, signal, sys
 import numpy as np
 from refract_core.errors import ImageError
-from refract_core.image import write_frame
+from refract_core.images.pictures import write_frame
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))
 noise = np.random.default_rng(0).random((400, 400, 4), np.float32)
