@@ -44,8 +44,8 @@ WINGS = (
 )  # fmt: skip
 # The same inside the wing that is a house of its own.
 USD_ROOMS = (
-    "diagnostics", "values", "layers", "materials", "geometry", "lights", "probes", "stage", "convert", "thickness",
-    "rules",
+    "diagnostics", "values", "registering", "ours", "layers", "materials", "geometry", "lights", "probes", "stage",
+    "convert", "thickness", "rules",
 )  # fmt: skip
 
 # Importer -> what it may never import: the start of a module's name.

@@ -5,7 +5,6 @@ __all__ = [
     "diagnostics",
     "layers",
     "materials",
-    "ours",
     "probes",
     "registering",
     "rules",

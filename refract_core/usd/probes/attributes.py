@@ -57,7 +57,7 @@ def floats(
     limits = list(zip(low, high, strict=True))
     used = _within(found, limits, above) or fallback(probe, name)
     if used != found:
-        probe.say(f"{name} is {value}; it must be {_rangelisted(limits, above)}; {listed(used)} is used")
+        probe.say(f"{name} is {value}; it must be {_range_text(limits, above)}; {listed(used)} is used")
     return used
 
 
@@ -109,7 +109,7 @@ def _within(
     return tuple(min(max(number, low), high) for number, low, high in pairs)
 
 
-def _rangelisted(limits: list[tuple[float, float]], above: bool) -> str:
+def _range_text(limits: list[tuple[float, float]], above: bool) -> str:
     count = {1: "a number", 2: "two numbers", 3: "three numbers", 6: "six numbers"}[len(limits)]
     low, high = limits[0][0], [most for _, most in limits]
     if above:
