@@ -35,12 +35,14 @@ _LENGTH_TOLERANCE = 5e-5  # [m]
 
 
 def settings_of(seed: int) -> rc.RenderSettings:
-    """Every order of the tiers the oracle knows, one layer or four, one sample or two, HDRP's unmeasured models."""
+    """Every order of the tiers the oracle knows, one layer or four, one sample or two, HDRP's unmeasured models, one
+    model for all."""
     chosen: dict[str, Any] = {"tiers": (("ray", "sky"), ("ray", "sky"), ("sky",), ("ray",), ("sky", "ray"))[seed % 5]}
     chosen["samples"] = 2 if seed % 7 == 3 else 1
     chosen["max_layers"] = 1 if seed % 11 == 5 else 4
     chosen["screen"] = "proxy" if seed % 13 == 6 else "march"
     chosen["exposure"] = 1.0 if seed % 17 == 8 else 0.0
+    chosen["model"] = {9: "box", 10: "traced", 11: "thin", 12: "sphere"}.get(seed % 19, "")
     return rc.RenderSettings(image_width=WIDTH, image_height=HEIGHT, jobs=1, **chosen)
 
 
