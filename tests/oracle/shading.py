@@ -9,7 +9,7 @@ from refract_core.scene import Param, Scene
 
 from . import lights, sampling
 from .sampling import Key
-from .sky import Sky
+from .sky import Sky, sky_of
 from .surface import Surface, number, specular_albedo, surface_at
 from .vec import ZERO, Vec, add, basis, clamp, cross, dot, mul, scaled, sub, unit, vec
 from .world import NEAR, OPAQUE, Hit, World, first
@@ -42,7 +42,7 @@ class Shader:
     def __init__(self, scene: Scene, eye: Vec) -> None:
         self.scene = scene
         self.world = World(scene)
-        self.sky = Sky(scene.environment) if scene.environment is not None else None
+        self.sky = sky_of(scene.environment) if scene.environment is not None else None
         self.lamps = lights.lamps_of(scene, eye)
         self.unsure = False
         """A surface was there or not by a chance that hangs on the last bit of a ray."""

@@ -20,6 +20,16 @@ _EVENLY = 0.01
 _MOST = 1e30
 
 
+_KNOWN: dict[int, tuple[Environment, Sky]] = {}
+
+
+def sky_of(environment: Environment) -> Sky:
+    """One `Sky` for each environment: its irradiance takes long to sum, and scenes share it."""
+    if id(environment) not in _KNOWN:
+        _KNOWN[id(environment)] = environment, Sky(environment)
+    return _KNOWN[id(environment)][1]
+
+
 class Sky:
     """One environment. Lookups are bilinear on the map's mip chain and meet in one value at each pole."""
 
