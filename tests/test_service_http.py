@@ -149,6 +149,7 @@ def test_cancel_kills_the_process(client: httpx.Client, server: Server) -> None:
     where = job.headers["location"]
     until(lambda: client.get(where).json()["fraction"] > 0.0)
     before = server.workers()
+    assert before
     cancelled = client.delete(where).json()
     assert cancelled["status"] == "cancelled"
     assert cancelled["problem"]["type"] == "/problems/cancelled"
