@@ -127,6 +127,11 @@ MUTANTS = (
     # --- the picture
     Mutant("layers behind the first get lost", "rendering/layered.py",
            "used < self.max_layers", "used < min(2, self.max_layers)"),
+    Mutant("one back face sends its whole tile on", "view/gbuffer.py",
+           "if inside and previous.inside[y, x] == 0:", "if inside and previous.inside[y, x] > 1:",
+           (ORACLE, "tests/test_exits.py", "tests/test_render_frame.py")),
+    Mutant("dispersion by the last face of a block", "transport/layers.py",
+           "                return True\n    return False", "                return lane == 0\n    return False"),
     Mutant("the depth of glass is that of what is behind", "transport/layers.py",
            "            planes.z_depth[y, x] = query.z_self[lane]", "            planes.z_depth[y, x] += 0.0"),
 )  # fmt: skip

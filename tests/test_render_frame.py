@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scenes import box, camera, checker_room, draw, glass, light, material, quad, scene, turned
+from scenes import box, camera, checker_room, draw, glass, light, material, quad, scene, shell, turned
 
 import refract_core as rc
 from refract_core.errors import Cancelled, UsageError
@@ -73,6 +74,34 @@ def test_the_picture_does_not_depend_on_workers_or_tiles(mixed: Scene, change: d
     """Bit-equal, on a size that no tile divides."""
     settings: dict[str, Any] = {"samples": 2, "tiers": ("screen", "probe", "sky")}
     assert_same(draw(mixed, 75, 53, **settings), draw(mixed, 75, 53, **{**settings, **change}))
+
+
+@pytest.fixture(scope="module")
+def meshes() -> Scene:
+    """Glass as meshes of every kind in a checkered room: hollow, turned inside out, open, touching the floor; the
+    samples of a pixel meet front faces, back faces and edges."""
+    walls, materials, textures = checker_room()
+    floor = quad("/floor", [(-2, -1, 2), (2, -1, 2), (2, -1, -2), (-2, -1, -2)], 6)
+    hollow = shell("/hollow", 0.55, 0.4, 7)
+    hollow = replace(hollow, points=(hollow.points + np.array([-0.6, -0.2, 0.2])).astype(np.float32))
+    wrong = box("/wrong", (0.3, 0.3, 0.3), 7, turned((0, 1, 0), 25), (0.5, 0.3, 0.1))
+    wrong = replace(wrong, triangles=np.ascontiguousarray(wrong.triangles[:, ::-1]))
+    standing = box("/standing", (0.3, 0.35, 0.3), 8, turned((0, 1, 0), 40), (0.6, -0.65, 0.5))
+    pane = quad("/pane", [(-1.2, 0.2, 0.9), (0.2, 0.2, 0.7), (0.2, 1.0, 0.7), (-1.2, 1.0, 0.9)], 9)
+    tinted = glass(Model.TRACED, ROUGHNESS=0.2, TRANSMITTANCE=(0.9, 0.5, 0.4), absorption_distance=0.5)
+    grey = material("/grey", DIFFUSE=0.5, ROUGHNESS=0.4, IOR=1.5)
+    lamp = light(LightKind.RECT, (0, 2, 0), (0, -1, 0), (1.0, 1.0), 2.0)
+    return scene(
+        [*walls, floor, hollow, wrong, standing, pane],
+        [*materials, grey, glass(Model.TRACED), tinted, glass(Model.THIN)],
+        textures=textures, lights=(lamp,),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("change", [{"jobs": 2}, {"tile_size": 8}, {"tile_size": 20, "jobs": 3}])
+def test_meshes_at_sixteen_samples_do_not_depend_on_workers_or_tiles(meshes: Scene, change: dict[str, int]) -> None:
+    settings: dict[str, Any] = {"samples": 16, "tiers": ("screen", "ray", "sky")}
+    assert_same(draw(meshes, 75, 53, **settings), draw(meshes, 75, 53, **{**settings, **change}))
 
 
 def test_a_given_executor_draws_the_same(mixed: Scene) -> None:

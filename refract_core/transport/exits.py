@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
+
 from ..kernels.compile import inlined
 from ..kernels.lanes import LANES, Flags, Scalars, Vectors, Words, put
 from ..kernels.vec import Vec, along, dot, flip_towards, mul, normalize, row, scale, sub
@@ -99,7 +101,8 @@ def load_medium(exits: Exits, lane: int, at: Interaction, world: World, override
     exits.model[lane] = model
     exits.ior[lane] = max(1.0, float_input(world, at, Param.IOR.value))
     exits.thickness[lane] = thickness_of(model, float_input(world, at, Param.THICKNESS.value))
-    exits.absorption_distance[lane] = absorption_distance_of(model, world.materials.absorption_distance[m])
+    distance: float = np.float64(world.materials.absorption_distance[m])
+    exits.absorption_distance[lane] = absorption_distance_of(model, distance)
     put(exits.color, lane, color_input(world, at, Param.TRANSMITTANCE.value))
 
 
