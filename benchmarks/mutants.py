@@ -98,12 +98,12 @@ MUTANTS = (
     Mutant("a light's diffuse multiplier forgotten", "world/shading.py", " * lights.diffuse[l]", "",
            (ORACLE, "tests/test_lights.py")),
     Mutant("a rect light shines backwards", "world/lights.py",
-           "if dot(to, face) >= 0.0:", "if dot(to, face) >= 1e30:", (ORACLE, "tests/test_lights.py")),
+           "if dot(to, lamp.face) >= 0.0:  # behind it", "if dot(to, lamp.face) >= 1e30:", (ORACLE, "tests/test_lights.py")),
     Mutant("the dome turns the other way", "world/environment.py",
            "return 0.5 - math.atan2(x, z) / (2.0 * math.pi)", "return 0.5 + math.atan2(x, z) / (2.0 * math.pi)",
            (ORACLE, "tests/test_environment.py")),
     Mutant("a light's horizon is not clipped", "world/lights.py",
-           "    if cut:\n        total += ", "    if cut and total < 0.0:\n        total += ",
+           "        total += _polygon_edge(leaving, entering, n)", "        total += 0.0",
            (ORACLE, "tests/test_lights.py")),
     # --- physics
     Mutant("Fresnel of one polarisation", "optics/interface.py",
@@ -114,7 +114,7 @@ MUTANTS = (
            "slope = (ior - 1.0) / (abbe *", "slope = 0.5 * (ior - 1.0) / (abbe *", (ORACLE, "tests/test_optics.py")),
     # --- tiers
     Mutant("the proxy tier reads foreground", "view/screen.py",
-           "if there > z_self else 0.0", "if there > 0.0 else 0.0", (ORACLE, "tests/test_screen.py")),
+           "if there > shaded.z_depth else 0.0", "if there > 0.0 else 0.0", (ORACLE, "tests/test_screen.py")),
     Mutant("no fade at the edge of the screen", "probes/volumes.py",
            "return smooth01(steep * (1.0 - abs(2.0 * u - 1.0))) * ", "return ",
            (ORACLE, "tests/test_volumes.py", "tests/test_screen.py")),
