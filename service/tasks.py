@@ -171,7 +171,7 @@ def pointer(text: str) -> str:
 
 
 def _inspect(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[str, int], say: Say) -> Any:
-    from refract_core import inspect as room
+    from refract_core.verbs import inspect as room
 
     report = room.inspect(stage)
     _write(out, _clean(report))
