@@ -141,7 +141,7 @@ def test_what_has_no_far_side_is_named_and_left_alone(tmp_path: Path) -> None:
     assert "warning /W/Fin: left alone: it is not manifold" in told
     assert "warning /W/Inwards: left alone: its faces look inwards" in told
     assert "warning /W/Flat: left alone: its transform" in told
-    assert "\n/W/Pane: left alone: the thin model" in told
+    assert "\n/W/Pane: left alone: its model" in told
     layer = Sdf.Layer.FindOrOpen(str(tmp_path / "out.usda"))
     assert list(layer.rootPrims) == []
 
