@@ -4,7 +4,7 @@ The oracle computes in double precision without an acceleration structure; the e
 pixel may differ where the picture itself is unsteady: the edge of a thing, of a shadow, of total reflection, of a texel
 that is repeated, seen directly or through glass. Such a pixel is let pass only if the oracle's own answer changes by
 half of the difference when it looks a thousandth of a pixel aside, and no more than one pixel in fifty may need that
-(of 150 scenes, 134 have none, and none has more than two).
+(in 240 further scenes 9 of 46,080 pixels did, and none differed without it).
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from refract_core.scene import Camera, Param, Scene
+from refract_core.scene import Camera, Model, Param, Scene
 from refract_core.settings import RenderSettings
 
 from . import optics, sampling
@@ -142,8 +142,8 @@ class Oracle:
         return [self._with_width(h) for h in entered[: self.settings.max_layers]]
 
     def _enters(self, hit: Hit, d: Vec) -> bool:
-        thin = self.shader.world.material(hit).model.name == "THIN"
-        return hit.face.sheet or thin or dot(hit.ng, d) < 0.0
+        pane = hit.face.sheet or self.shader.world.material(hit).model is Model.THIN
+        return pane or dot(hit.ng, d) < 0.0
 
     def _with_width(self, hit: Hit) -> Hit:
         return hit._replace(width=self.spread * hit.t)
