@@ -192,14 +192,18 @@ def _dressed(dice: Dice, mesh: Mesh) -> Mesh:
             primvars[name] = dice.rng.uniform(0.1, 0.9, shape).astype(np.float32)
     primvars["st"] = mesh.primvars.get("st", dice.rng.uniform(0, 1.2, (t, 3, 2)).astype(np.float32))
     primvars["flat_st"] = dice.rng.uniform(0, 1, (1, 1, 2)).astype(np.float32)
-    normals = None
     if dice.chance(0.4):
-        corners = mesh.points.astype(np.float64)[mesh.triangles]
-        flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        flat /= np.linalg.norm(flat, axis=-1, keepdims=True)
-        bent = flat[:, None] + dice.rng.uniform(-0.25, 0.25, (t, 3, 3))
-        normals = (bent / np.linalg.norm(bent, axis=-1, keepdims=True)).astype(np.float32)
-    return replace(mesh, primvars=primvars, normals=normals)
+        return replace(with_bent_normals(mesh, 0.25, dice.rng), primvars=primvars)
+    return replace(mesh, primvars=primvars)
+
+
+def with_bent_normals(mesh: Mesh, by: float, rng: np.random.Generator) -> Mesh:
+    """Corner normals that lean away from their face's by up to `by` along each axis."""
+    corners = mesh.points.astype(np.float64)[mesh.triangles]
+    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    flat /= np.linalg.norm(flat, axis=-1, keepdims=True)
+    bent = flat[:, None] + rng.uniform(-by, by, corners.shape)
+    return replace(mesh, normals=(bent / np.linalg.norm(bent, axis=-1, keepdims=True)).astype(np.float32))
 
 
 class _Builder:
@@ -258,6 +262,8 @@ class _Builder:
             other = self.of(_glass(dice, of.model))
             mesh = replace(mesh, materials=np.where(dice.rng.random(len(mesh.triangles)) < 0.5, index, other))
             mesh = replace(mesh, materials=mesh.materials.astype(np.int32))
+        if of.refractive and kind != "standing" and dice.chance(0.2):  # inside out: view rays meet its back first
+            mesh = replace(mesh, triangles=mesh.triangles[:, ::-1].copy())
         self.add(mesh)
 
     def pane(self, z: float) -> None:

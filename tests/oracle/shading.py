@@ -45,7 +45,7 @@ class Shader:
         self.sky = sky_of(scene.environment) if scene.environment is not None else None
         self.lamps = lights.lamps_of(scene, eye)
         self.unsure = False
-        """A surface was there or not by a chance that hangs on the last bit of a ray."""
+        """Something hung on the last bits of a ray: a chance decided by them, or a walk of many reflections."""
 
     # --- Rays ---
 

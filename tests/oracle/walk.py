@@ -19,6 +19,8 @@ from .vec import Vec, dot, mul, scaled, sub, unit
 from .world import GLASS, NEAR, OPAQUE, Hit, first
 
 _MOST_INTERFACES = 24
+_FORGOTTEN = 8
+"""After so many reflections, each of which may double an error, float32 does not say any more where a ray is."""
 _LEAST_THICKNESS = 1e-4
 _CONTACT = (4e-5, 4e-6)
 """Glass stands on a table where they are nearer than this: relative to the place, and in metres."""
@@ -115,7 +117,8 @@ class Walk:
 
     def follow(self) -> Exit:
         status = Status.LOST
-        for _ in range(_MOST_INTERFACES):
+        for met in range(_MOST_INTERFACES):
+            self.shader.unsure = self.shader.unsure or met >= _FORGOTTEN
             hit = self._next()
             if hit is None:
                 status = Status.LEFT
