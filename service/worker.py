@@ -35,8 +35,9 @@ _UNSET = ("PXR_PLUGINPATH_NAME", "PXR_AR_DEFAULT_SEARCH_PATH", "OCIO", "PYTHONST
 def environment() -> dict[str, str]:
     """Variables of the worker: libraries without threads of their own, no plug-ins, no secrets of the server."""
     kept = {key: value for key, value in os.environ.items() if key not in _UNSET and not key.startswith("REFRACT_")}
-    if "REFRACT_CACHE_DIR" in os.environ:
-        kept["REFRACT_CACHE_DIR"] = os.environ["REFRACT_CACHE_DIR"]
+    for name in ("REFRACT_CACHE_DIR", "REFRACT_KERNELS"):
+        if name in os.environ:
+            kept[name] = os.environ[name]
     return {**kept, **_QUIET}
 
 

@@ -19,8 +19,8 @@ PACKAGES = ("refract_core", "schemas", "service")
 ROOMS = {
     "pxr": ("refract_core.usd", "schemas", "service.precheck"),
     "embreex": ("refract_core.world.embree",),
-    "ctypes": ("refract_core.world.embree", "service"),
-    "llvmlite": ("refract_core.kernels.jit", "refract_core.kernels.linking", "refract_core.kernels.pointer_type"),
+    "ctypes": ("refract_core.kernels.ahead", "refract_core.world.embree", "service"),
+    "llvmlite": ("refract_core.kernels",),
     "numba": ("refract_core.kernels.jit", "refract_core.kernels.linking", "refract_core.kernels.pointer_type"),
     "OpenImageIO": ("refract_core.images",),
     "pygltflib": ("refract_core.usd.convert.gltf_file",),

@@ -129,7 +129,8 @@ def test_an_edit_of_anything_else_keeps_the_key(edits: dict[str, tuple[str, str]
 def copied_engine(tmp_path: Path) -> Path:
     """A folder with a copy of the package, to be edited."""
     copy = tmp_path / "copy"
-    shutil.copytree(ROOT / "refract_core", copy / "refract_core", ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("refract_core", "schemas"):
+        shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
     return copy
 
 

@@ -16,6 +16,7 @@ from . import (  # noqa: F401  a command is known once its module is loaded
     render,
     serve,
     validate,
+    warm,
 )
 from .app import CANCELLED, app
 

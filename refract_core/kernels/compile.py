@@ -1,45 +1,55 @@
 """The decorators of per-pixel code. What they give is compiled when it is first called, not when it is defined.
 
-Nothing here knows numba: it is loaded when a kernel has to be compiled, or loaded from where it was kept.
+Nothing here knows numba: it is loaded when a kernel has to be compiled, or loaded from where it was kept (`jit`).
+Kernels that were compiled when the package was built never need it (`ahead`).
 """
 
 from __future__ import annotations
 
 import functools
+import logging
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from . import store
+from . import ahead, store
+from .declared import signature_of
+from .external import External
 from .store import cache_root, keep_nothing
 
-__all__ = ["External", "cache_root", "flag", "inlined", "is_compiled", "keep_nothing", "kernel", "leaf", "word"]
+__all__ = [
+    "External", "Kernel", "cache_root", "flag", "inlined", "is_compiled", "keep_nothing", "kernel", "leaf", "word",
+]  # fmt: skip
 
 F = TypeVar("F", bound=Callable[..., Any])
+_LOG = logging.getLogger(__name__)
+_NOT_LOOKED_FOR: Any = object()
 
 
-_BOUND: dict[str, int] = {}
-"""Addresses of C functions by their names."""
-
-
-@functools.cache
 def _jit() -> Any:
     """The room that knows numba; it takes a third of a second to load."""
     from . import jit
 
-    for name, address in _BOUND.items():
-        jit.bind(name, address)
     return jit
 
 
 class Kernel:
-    """A compiled function that Python calls: per tile, not per pixel."""
+    """A compiled function that Python calls: per tile, not per pixel. Its annotations are its signature."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         functools.update_wrapper(self, function)
         self.py_func = function
+        self._native: Any = _NOT_LOOKED_FOR
         self._compiled: Any = None
+
+    @property
+    def native(self) -> ahead.Native | None:
+        """The form of it that came with the package."""
+        if self._native is _NOT_LOOKED_FOR:
+            self._native = ahead.find(self.py_func)
+        found: ahead.Native | None = self._native
+        return found
 
     @property
     def compiled(self) -> Any:
@@ -48,11 +58,23 @@ class Kernel:
             self._compiled = _jit().kernel(self.py_func)
         return self._compiled
 
+    def warm(self) -> bool:
+        """Have numba compile it for what it declares, or load it. True where it had to be compiled."""
+        known = tuple(_jit().pointer_type.type_of(kind) for kind in signature_of(self.py_func).arguments)
+        self.compiled.compile(known)
+        return not self.compiled.stats.cache_hits
+
     @property
     def _numba_type_(self) -> Any:
         return _jit().type_of(self.compiled)
 
     def __call__(self, *arguments: Any) -> Any:
+        native = self.native
+        if native is not None:
+            try:
+                return native(arguments)
+            except ahead.Mismatch:
+                _LOG.info("%s was not compiled for what it is called with; numba compiles it", self.py_func.__name__)
         return self.compiled(*arguments)
 
 
@@ -76,33 +98,10 @@ class Inlined:
         return self._for_python(*arguments)
 
 
-class External:
-    """A function of a C library that kernels call: every argument is one machine word, and it gives nothing back."""
-
-    def __init__(self, name: str, arguments: int) -> None:
-        self.name, self.arguments = name, arguments
-
-    @property
-    def key(self) -> str:
-        return f"{self.name} {self.arguments}"
-
-    @property
-    def _numba_type_(self) -> Any:
-        return _jit().external(self.name, self.arguments)
-
-    def __call__(self, *words: int) -> None:
-        raise TypeError(f"{self.name} is called by kernels, not by Python")
-
-    def bind(self, address: int) -> None:
-        """Say where the function is. Kernels that call it can be loaded only afterwards."""
-        _BOUND[self.name] = address
-        if _jit.cache_info().currsize:
-            _jit().bind(self.name, address)
-
-
 def kernel(function: F) -> F:
     """Compile `function` when first called (or load it), to run without the GIL.
 
+    Its annotations are its signature (`declared`); where it says that it takes a record, it is called with a `Pointer`.
     Division by zero gives inf or NaN as in numpy, never an exception: a ray that fails is a status.
     """
     compiled: Any = Kernel(function)
@@ -139,7 +138,9 @@ def flag(value: bool) -> bool:
 
 
 def is_compiled(compiled: Callable[..., Any]) -> bool:
-    """A compiled form of this kernel is in memory or on disk."""
+    """A compiled form of this kernel came with the package, or is in memory or on disk."""
     assert isinstance(compiled, Kernel)
+    if compiled.native is not None:
+        return True
     in_memory = compiled._compiled is not None and bool(compiled._compiled.signatures)
     return in_memory or store.is_kept(compiled.py_func)

@@ -15,10 +15,12 @@ import llvmlite.binding as llvm
 import numba
 from numba import types
 from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.extending import typeof_impl
 
 from . import linking, pointer_type, store
+from .external import External, tell
 
-__all__ = ["bind", "called_from_python", "external", "inlined", "kernel", "pointer_type", "type_of"]
+__all__ = ["NONE", "ahead", "called_from_python", "inlined", "kernel", "pointer_type", "type_of"]
 
 OPTIONS: dict[str, Any] = {
     "nogil": True,
@@ -27,6 +29,8 @@ OPTIONS: dict[str, Any] = {
     "fastmath": {"contract", "nsz"},
 }
 _ONE_AT_A_TIME = threading.RLock()
+NONE = types.none
+"""The type of no result."""
 
 
 class _Place:
@@ -89,6 +93,11 @@ def inlined(function: Callable[..., Any], merged: bool) -> Any:
         return _inlined(function, merged)
 
 
+def ahead(function: Callable[..., Any]) -> Any:
+    """A kernel to be compiled for other machines: no entry for Python, nothing allocated."""
+    return numba.njit(_nrt=False, no_cfunc_wrapper=True, **OPTIONS, **linking.AHEAD)(function)
+
+
 def called_from_python(function: Callable[..., Any]) -> Any:
     """A function of kernels on its own, for Python; it is not kept."""
     with _ONE_AT_A_TIME:
@@ -100,11 +109,10 @@ def type_of(made: Any) -> Any:
     return types.Dispatcher(made)
 
 
-def external(name: str, arguments: int) -> Any:
-    """The type of a C function: words in, nothing out."""
-    return types.ExternalFunction(name, types.void(*[types.intp] * arguments))
+@typeof_impl.register(External)
+def _typeof_external(value: External, _context: Any) -> Any:
+    return types.ExternalFunction(value.name, types.void(*[types.intp] * value.arguments))
 
 
-def bind(name: str, address: int) -> None:
-    """Tell LLVM where a C function is. Compiled code holds its name, so that it can be kept on disk."""
-    llvm.add_symbol(name, address)
+# Compiled code holds a function's name, so that it can be kept on disk; LLVM puts in the address when it is loaded.
+tell(llvm.add_symbol)

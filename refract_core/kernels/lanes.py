@@ -30,11 +30,21 @@ class Column(NamedTuple):
     dtype: type[np.generic]
     per_lane: tuple[int, ...] = ()
 
+    @property
+    def axes(self) -> int:
+        """Number of axes of its array."""
+        return 1 + len(self.per_lane)
+
 
 class Rows(NamedTuple):
     """A field of several columns, each with a value per lane: shape (number, 8) float64."""
 
     number: int
+
+    @property
+    def axes(self) -> int:
+        """Number of axes of its array."""
+        return 2
 
 
 Flags = Annotated[NDArray[np.int32], Column(np.int32)]

@@ -84,6 +84,29 @@ class Kernel(JITCodeLibrary):  # type: ignore[misc]
         super().finalize()
 
 
+class Ahead(Kernel):
+    """A kernel that is going to run elsewhere: optimised, but not made machine code here."""
+
+    @property
+    def codegen(self) -> Any:
+        return _WithoutEnvironment(self._codegen)
+
+    def _finalize_final_module(self) -> None:
+        self._verify_declare_only_symbols()
+        self._finalized = True
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """As `Text`: there is nothing to be called."""
+        self._ensure_finalized()
+        address: int = llvm.address_of_symbol("PyErr_BadArgument")
+        return address
+
+    def module(self) -> Any:
+        """The optimised module, which is this library's last use of it."""
+        self._ensure_finalized()
+        return self._final_module
+
+
 def _callees(library: Any) -> list[Any]:
     """Everything that a library calls, directly or not, callers before what they call: LLVM inlines in that order, and
     frames were slower in any other."""
@@ -120,5 +143,7 @@ def _pipeline(kind: type[JITCodeLibrary]) -> type[Compiler]:
 
 KERNEL: dict[str, Any] = {"pipeline_class": _pipeline(Kernel)} if is_known() else {}
 """Options of a kernel's decorator."""
+AHEAD: dict[str, Any] = {"pipeline_class": _pipeline(Ahead), "no_cpython_wrapper": True} if is_known() else {}
+"""Options of a kernel's decorator that is compiled ahead of time."""
 TEXT: dict[str, Any] = {"pipeline_class": _pipeline(Text), "no_cpython_wrapper": True} if is_known() else {}
 """Options of the decorator of a function that kernels call."""

@@ -35,7 +35,13 @@ class Layout(NamedTuple):
     """each with its name, in order"""
 
 
-Kind = str | Array | Layout
+class Row(NamedTuple):
+    """A tuple of numbers, which only arguments and results are."""
+
+    kinds: tuple[Kind, ...]
+
+
+Kind = str | Array | Layout | Row
 """What a field is: INT, FLOAT, BOOL, an array, or a record in place."""
 
 

@@ -21,7 +21,7 @@ from numba.extending import (
 )
 from numba.np.arrayobj import populate_array
 
-from .pointer import BOOL, FLOAT, INT, Array, Kind, Layout, Pointer, words_of
+from .pointer import BOOL, FLOAT, INT, Array, Kind, Layout, Pointer, Row, words_of
 
 _NUMBERS = {INT: types.int64, FLOAT: types.float64, BOOL: types.boolean}
 
@@ -51,6 +51,8 @@ def type_of(kind: Kind) -> Any:
         return types.Array(from_dtype(np.dtype(kind.dtype)), kind.ndim, "C")
     if isinstance(kind, Layout):
         return PointerType(kind)
+    if isinstance(kind, Row):
+        return types.BaseTuple.from_types(tuple(type_of(inner) for inner in kind.kinds))
     return _NUMBERS[kind]
 
 

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import UsageError
+from ..kernels.arrays import F64_2D
 from ..kernels.compile import inlined, kernel
 from ..kernels.vec import Vec
 from ..models import Model
@@ -202,7 +203,7 @@ def _put(out: F64, i: int, at: int, v: Vec) -> None:
 
 
 @kernel
-def _run(formula: int, rows: F64, out: F64) -> None:
+def _run(formula: int, rows: F64_2D, out: F64_2D) -> None:
     """One formula over rows that hold its arguments side by side: no column beyond them may be read."""
     for i in range(rows.shape[0]):
         if formula == _Formula.REFLECT:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..kernels.arrays import F64_1D, F64_2D
 from ..kernels.compile import inlined, kernel
 from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Scalars, by_address, scratch
 from ..kernels.sampling import Key, pixel_offset, set_key
@@ -63,7 +64,7 @@ class Shot(NamedTuple):
 
     probe: int
     """row of the table"""
-    volume: NDArray[np.float64]
+    volume: F64_2D
     """shape (4, 4): world_from_volume of its influence, in whose frame a window lies"""
     mask: int
     """what it sees"""
@@ -71,9 +72,9 @@ class Shot(NamedTuple):
     """along the axis of a cube's face [m]; a window has its plane for a near plane"""
     far: float
     """the same [m]; along the ray behind a window"""
-    background: NDArray[np.float64]
+    background: F64_1D
     """shape (4,): radiance where nothing is met, and 1; or zeros, so that the sky is left to whoever looks up"""
-    jitter: NDArray[np.float64]
+    jitter: F64_2D
     """shape (S, 2): place of each sample within its texel, -0.5 .. 0.5"""
     seed: int
     """of the sampling sequence"""

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..kernels.arrays import F32_1D, F64_2D, I64_1D
 from ..kernels.compile import inlined, kernel
 from ..kernels.lanes import by_address
 from ..kernels.vec import Vec, add, frame, normalize, scale
@@ -49,11 +50,11 @@ class Levels(NamedTuple):
 class Picture(NamedTuple):
     """All levels of one picture, to be looked up. The pool, which other pictures share, outlives it."""
 
-    texels: NDArray[np.float32]
+    texels: F32_1D
     """flat pool"""
-    first: NDArray[np.int64]
+    first: I64_1D
     """shape (L,): offset of each level in the pool"""
-    side: NDArray[np.int64]
+    side: I64_1D
     """shape (L,): texels on a side of each, without the border"""
     last: int
     """highest level there is; arrays may be longer"""
@@ -62,7 +63,7 @@ class Picture(NamedTuple):
 class Level(NamedTuple):
     """One level of a picture, to be written. The pool outlives it."""
 
-    texels: NDArray[np.float32]
+    texels: F32_1D
     """flat pool"""
     first: int
     """offset of the level in the pool"""
@@ -247,6 +248,11 @@ def halve(source: Level, target: Level, faces: int) -> None:
 # ------------------------------------------------------------------------------------------------ prefilter
 
 
+@kernel
+def _roughness_of(level: float) -> float:
+    return probe_roughness_hdrp(level)
+
+
 def lobe_samples(level: int, resolution: int) -> NDArray[np.float64]:
     """Directions of the GGX lobe that a level is blurred by, seen along the normal, for filtered importance sampling.
 
@@ -256,7 +262,7 @@ def lobe_samples(level: int, resolution: int) -> NDArray[np.float64]:
     Returns:
         shape (S, 5): x, y, z in the frame of the lobe's axis, weight (sums to 1), level of averages to read.
     """
-    roughness = float(probe_roughness_hdrp(float(level)))
+    roughness = _roughness_of(float(level))
     a2 = max(roughness, 1e-3) ** 4
     count = _LOBE_SAMPLES << level
     ring = np.arange(count) // 2  # two opposite samples on each, so that the lobe does not lean to one side
@@ -277,7 +283,7 @@ def lobe_samples(level: int, resolution: int) -> NDArray[np.float64]:
 
 
 @kernel
-def filter_face(source: Picture, target: Level, face: int, lobe: NDArray[np.float64]) -> None:
+def filter_face(source: Picture, target: Level, face: int, lobe: F64_2D) -> None:
     """Blur a picture's averages, `source`, into one face of a level, by the samples of a lobe (`lobe_samples`)."""
     n = target.side
     for y in range(n):

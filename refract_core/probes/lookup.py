@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..kernels.arrays import F32_1D, F64_1D, F64_2D, F64_3D, I64_1D, I64_2D, U8_1D
 from ..kernels.compile import inlined
 from ..kernels.vec import Vec, along, length, row, scale, sub, transform_direction, transform_point
 from ..optics.interface import probe_lod_hdrp
@@ -31,42 +32,42 @@ _AVERAGE_MEDIAN = 0.59
 class ProbeTable(NamedTuple):
     """All probes in the order in which they are asked: importance, then smaller volume (HDRP, 4.7)."""
 
-    texels: NDArray[np.float32]
+    texels: F32_1D
     """flat pool of every picture's levels (see `faces`)"""
-    first: NDArray[np.int64]
+    first: I64_2D
     """shape (K, L): offset of each level in the pool"""
-    side: NDArray[np.int64]
+    side: I64_2D
     """shape (K, L): texels on a side of each level"""
-    last: NDArray[np.int64]
+    last: I64_1D
     """shape (K,): highest level"""
-    planar: NDArray[np.uint8]
-    capture: NDArray[np.float64]
+    planar: U8_1D
+    capture: F64_2D
     """shape (K, 3) [m]"""
-    eye: NDArray[np.float64]
+    eye: F64_2D
     """shape (K, 4): the camera in the influence volume's frame, homogeneous: a point [m] and 1, or for an orthographic
     camera the direction towards it and 0"""
-    owned: NDArray[np.uint8]
+    owned: U8_1D
     """shape (K,): 1 where it serves only the things that are given to it"""
     reach: Reach
     """of the influence volumes of those that serve everything"""
-    influence: NDArray[np.float64]
+    influence: F64_3D
     """shape (K, 4, 4) volume_from_world"""
-    influence_sphere: NDArray[np.uint8]
-    influence_extents: NDArray[np.float64]
+    influence_sphere: U8_1D
+    influence_extents: F64_2D
     """shape (K, 3) [m]"""
-    proxy: NDArray[np.float64]
+    proxy: F64_3D
     """shape (K, 4, 4) volume_from_world"""
-    proxy_kind: NDArray[np.uint8]
+    proxy_kind: U8_1D
     """shape (K,): 0 box, 1 sphere, 2 infinite"""
-    proxy_extents: NDArray[np.float64]
-    blend: NDArray[np.float64]
+    proxy_extents: F64_2D
+    blend: F64_2D
     """shape (K, 6) [m]"""
-    blend_normal: NDArray[np.float64]
-    face_fade: NDArray[np.float64]
-    weight: NDArray[np.float64]
+    blend_normal: F64_2D
+    face_fade: F64_2D
+    weight: F64_1D
     """shape (K,): weight with the fade by distance to the camera in it"""
-    multiplier: NDArray[np.float64]
-    sharp_near: NDArray[np.uint8]
+    multiplier: F64_1D
+    sharp_near: U8_1D
     """shape (K,): HDRP's distance-based roughness"""
 
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..kernels.arrays import F64_2D, I64_3D
 from ..kernels.compile import inlined
 
 WORD = 32
@@ -20,9 +21,9 @@ WORD = 32
 class Reach(NamedTuple):
     """The cut axes."""
 
-    cuts: NDArray[np.float64]
+    cuts: F64_2D
     """shape (3, C): ascending [m]"""
-    sets: NDArray[np.int64]
+    sets: I64_3D
     """shape (3, C + 1, W): probe k is bit k % WORD of word k // WORD"""
 
 

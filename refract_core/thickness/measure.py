@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..kernels.arrays import F32_2D, F64_2D, I64_1D, U32_2D
 from ..kernels.compile import inlined, kernel
 from ..kernels.lanes import LANES, Scalars, by_address, scratch
 from ..kernels.vec import Vec, add, along, cross, dot, frame, normalize, row, scale, sub
@@ -67,11 +68,11 @@ _LEVELS = 2001  # quantised values of a normal's coordinate
 class Places(NamedTuple):
     """Where to measure: on triangles, with the normal that holds there."""
 
-    triangle: Index
+    triangle: I64_1D
     """shape (N,)"""
-    weights: F64
+    weights: F64_2D
     """shape (N, 2): barycentric weights of the triangle's second and third corner"""
-    normals: F64
+    normals: F64_2D
     """shape (N, 3): unit, outward"""
 
 
@@ -80,9 +81,9 @@ class Body(NamedTuple):
 
     handle: int
     """RTCScene"""
-    points: NDArray[np.float32]
+    points: F32_2D
     """shape (V, 3), what Embree was given"""
-    triangles: U32
+    triangles: U32_2D
     """shape (T, 3)"""
 
 
@@ -262,7 +263,7 @@ def _cast(casting: Casting, lane: int, body: Body, places: Places, i: int, view:
 
 
 @kernel
-def _measure(casting: Casting, body: Body, places: Places, rays: F64, sums: F64, first: int, last: int) -> None:
+def _measure(casting: Casting, body: Body, places: Places, rays: F64_2D, sums: F64_2D, first: int, last: int) -> None:
     """Cast the rays of the places `first` .. `last`; `sums` (N, 2) takes length times model path, and its square.
 
     Lanes are rays, not places: eight of them in a row, whichever place each belongs to.

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..kernels.arrays import F64_2D, F64_3D, I64_1D
 from ..kernels.compile import inlined, kernel
 from ..kernels.lanes import by_address
 from ..scene import F32
@@ -25,11 +26,11 @@ _INSIDE = 1.0e-4
 class Covered(NamedTuple):
     """Texels and the places they stand for, in the order in which triangles cover them."""
 
-    texel: Index
+    texel: I64_1D
     """shape (N,): row by row from the top"""
-    triangle: Index
+    triangle: I64_1D
     """shape (N,)"""
-    weights: F64
+    weights: F64_2D
     """shape (N, 2): barycentric weights of the triangle's second and third corner"""
 
 
@@ -180,7 +181,7 @@ def _areas(at: F64, t: int, sign: float, x: int, y: int) -> tuple[bool, float, f
 
 
 @kernel
-def _count(at: F64, size: int, tiled: bool, counts: Index) -> None:
+def _count(at: F64_3D, size: int, tiled: bool, counts: I64_1D) -> None:
     """How many texels each triangle covers. `at`: shape (T, 3, 2), whole numbers in the middle of texels."""
     for t in range(len(at)):
         sign = _sense(at, t)
@@ -194,7 +195,7 @@ def _count(at: F64, size: int, tiled: bool, counts: Index) -> None:
 
 
 @kernel
-def _list(at: F64, first: int, last: int, size: int, tiled: bool, found: Covered) -> None:
+def _list(at: F64_3D, first: int, last: int, size: int, tiled: bool, found: Covered) -> None:
     """Write down the texels of triangles `first` .. `last`; `found` has room for as many as `_count` says."""
     filled = 0
     for t in range(first, last):

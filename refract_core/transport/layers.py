@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..kernels.arrays import F32_2D, F32_3D, I64_1D
 from ..kernels.compile import inlined, kernel
 from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Scalars, Vectors, Words, put
 from ..kernels.sampling import Key, set_key
@@ -48,12 +48,12 @@ class LayerScratch(NamedTuple):
 class LayerResult(NamedTuple):
     """A composited layer before it is put into the picture. float32, written only where the layer is."""
 
-    color: NDArray[np.float32]
+    color: F32_3D
     """shape (H, W, 3): radiance of the pixel with this layer in front"""
-    alpha: NDArray[np.float32]
-    depth: NDArray[np.float32]
+    alpha: F32_2D
+    depth: F32_2D
     """shape (H, W) z_depth [m]"""
-    normal: NDArray[np.float32]
+    normal: F32_3D
     """shape (H, W, 3): geometric normal, towards the viewer"""
 
 
@@ -69,7 +69,7 @@ def new_layer_result(width: int, height: int) -> LayerResult:
 
 @kernel
 def put_tile(
-    layer: RefractiveLayer, result: LayerResult, opaque: OpaqueLayer, size: NDArray[np.int64], tile: Tile
+    layer: RefractiveLayer, result: LayerResult, opaque: OpaqueLayer, size: I64_1D, tile: Tile
 ) -> None:
     """Draw a composited layer into the picture, where it is."""
     for y in range(tile[1], min(tile[3], size[1])):

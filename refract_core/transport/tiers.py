@@ -12,6 +12,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..kernels.arrays import I32_1D
 from ..kernels.compile import flag, inlined
 from ..kernels.lanes import LANES, Column, Flags, Scalars, Vectors, Words
 from ..kernels.sampling import LEAF, Keys, Purpose, branched, key_of, set_key, unit_pair
@@ -73,13 +74,13 @@ class Query(NamedTuple):
 class Asking(NamedTuple):
     """Who is asked, and in which order: the same for every ray of a picture."""
 
-    order: NDArray[np.int32]
+    order: I32_1D
     """tier codes, first asked first"""
     by_proxy: bool
     """refraction asks the screen by HDRP's proxy instead of by march"""
     screen: Screen
     probes: ProbeTable
-    thing_probe: NDArray[np.int32]
+    thing_probe: I32_1D
     """shape (things,): the probe whose proxy serves each thing, or -1"""
 
 

@@ -1,5 +1,5 @@
-"""What a person can ask for, from Python, the command line or HTTP: render files, bake, convert, inspect, validate.
-Knows neither of the three.
+"""What a person can ask for, from Python, the command line or HTTP: render files, bake, convert, inspect, validate,
+warm up. Knows neither of the three.
 """
 
 __all__ = [
@@ -13,4 +13,5 @@ __all__ = [
     "override",
     "render_files",
     "validate",
+    "warm",
 ]

@@ -9,9 +9,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import UsageError
+from ..kernels.arrays import F64_1D, F64_2D, I64_1D
 from ..kernels.compile import inlined
 from ..kernels.vec import Vec, dot, normalize, row, sub
 from ..scene import Camera
@@ -23,13 +23,13 @@ Tile = tuple[int, int, int, int]
 class View(NamedTuple):
     """What kernels need of a camera."""
 
-    axes: NDArray[np.float64]
+    axes: F64_2D
     """shape (4, 3): right, up, forward (unit, engine world), eye [m]"""
-    window: NDArray[np.float64]
+    window: F64_1D
     """shape (4,): left, right, bottom, top at z_depth 1 (perspective) or in metres (orthographic)"""
-    size: NDArray[np.int64]
+    size: I64_1D
     """shape (2,): width, height [pixels]"""
-    clipping: NDArray[np.float64]
+    clipping: F64_1D
     """shape (2,): near, far z_depth [m]"""
     orthographic: bool
 

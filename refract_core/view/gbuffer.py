@@ -6,8 +6,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..kernels.arrays import F32_2D, F32_3D, I32_2D, U8_2D
 from ..kernels.compile import inlined, kernel
 from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Flags, Scalars
 from ..kernels.sampling import Key, set_key
@@ -52,29 +52,29 @@ class ViewScratch(NamedTuple):
 class OpaqueLayer(NamedTuple):
     """What the camera would see without refractive objects. One sample per pixel."""
 
-    color: NDArray[np.float32]
+    color: F32_3D
     """shape (H, W, 3) radiance; the environment where nothing was hit"""
-    depth: NDArray[np.float32]
+    depth: F32_2D
     """shape (H, W) z_depth [m]; inf where nothing was hit"""
-    normal: NDArray[np.float32]
+    normal: F32_3D
     """shape (H, W, 3): geometric normal on the camera's side"""
-    alpha: NDArray[np.float32]
+    alpha: F32_2D
     """shape (H, W): 1 on surfaces and on a visible environment, else 0"""
 
 
 class RefractiveLayer(NamedTuple):
     """The n-th refractive surface that each view ray enters, as a `surface.Hit`. All planes have shape (H, W)."""
 
-    part: NDArray[np.int32]
+    part: I32_2D
     """`NOTHING` where there is none"""
-    primitive: NDArray[np.int32]
-    instance: NDArray[np.int32]
-    material: NDArray[np.int32]
-    u: NDArray[np.float32]
-    v: NDArray[np.float32]
-    t: NDArray[np.float32]
+    primitive: I32_2D
+    instance: I32_2D
+    material: I32_2D
+    u: F32_2D
+    v: F32_2D
+    t: F32_2D
     """hit distance along the view ray [m]"""
-    inside: NDArray[np.uint8]
+    inside: U8_2D
     """1 where the hit is not one that the ray enters by: it starts in glass, or looks at an inner side"""
 
 
@@ -229,7 +229,7 @@ def peel_tile(
     view: View,
     scratch: ViewScratch,
     tile: Tile,
-    depth: NDArray[np.float32],
+    depth: F32_2D,
     previous: RefractiveLayer,
     layer: RefractiveLayer,
     inside: bool,

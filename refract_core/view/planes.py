@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..kernels.arrays import F32_2D, F32_3D, F64_2D, I64_1D
 from ..kernels.compile import kernel
 from ..kernels.vec import row, transform_direction, transform_point
 from ..scene import Scene
@@ -24,36 +25,36 @@ class Planes(NamedTuple):
     """One array per AOV, shape (H, W) or (H, W, C), float32, for the life of the frame. The first group is summed, the
     second kept from sample 0; what is said of units and frames holds until `finish_tile`, which goes to the stage's."""
 
-    beauty: F32
+    beauty: F32_3D
     """(H, W, 4): radiance, and alpha"""
-    mask: F32
+    mask: F32_2D
     """samples that met glass"""
-    refraction: F32
+    refraction: F32_3D
     """(H, W, 3): radiance that came through the nearest layer"""
-    reflection: F32
+    reflection: F32_3D
     """(H, W, 3): radiance that it reflected"""
-    transmittance: F32
+    transmittance: F32_3D
     """(H, W, 3): what the glass left of the light"""
-    screen: F32
+    screen: F32_2D
     """weight of a tier in what came through; so are the next three"""
-    ray: F32
-    probe: F32
-    sky: F32
-    none: F32
+    ray: F32_2D
+    probe: F32_2D
+    sky: F32_2D
+    none: F32_2D
     """weight that no tier answered"""
-    confidence: F32
+    confidence: F32_2D
 
-    normal: F32
+    normal: F32_3D
     """(H, W, 3): unit, engine world"""
-    point: F32
+    point: F32_3D
     """(H, W, 3): [stage units], stage; made by `finish_tile` alone"""
-    z_depth: F32
+    z_depth: F32_2D
     """[m]; inf where nothing is"""
-    thickness: F32
+    thickness: F32_2D
     """[m]"""
-    path_length: F32
+    path_length: F32_2D
     """[m]"""
-    layers: F32
+    layers: F32_2D
     """how many were met"""
 
 
@@ -66,9 +67,9 @@ class Finish(NamedTuple):
     """exposure times share"""
     unit: float
     """stage units per metre"""
-    stage_from_engine: NDArray[np.float64]
+    stage_from_engine: F64_2D
     """shape (4, 4), to stage units"""
-    stage_rotation: NDArray[np.float64]
+    stage_rotation: F64_2D
     """shape (3, 3)"""
 
 
@@ -145,7 +146,7 @@ def finish_tile(planes: Planes, view: View, finish: Finish, tile: Tile) -> None:
 
 
 @kernel
-def add_tile(planes: Planes, opaque: OpaqueLayer, size: NDArray[np.int64], tile: Tile) -> None:
+def add_tile(planes: Planes, opaque: OpaqueLayer, size: I64_1D, tile: Tile) -> None:
     """Add a finished sample's picture (the opaque layer, its glass drawn in) to the beauty. `size`: width, height."""
     for y in range(tile[1], min(tile[3], size[1])):
         for x in range(tile[0], min(tile[2], size[0])):

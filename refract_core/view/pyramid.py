@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..kernels.arrays import F32_1D, F32_2D, F32_3D, I64_2D
 from ..kernels.compile import inlined, kernel
 from ..kernels.vec import Vec
 from .camera import View
@@ -28,16 +29,16 @@ _TAPS = np.array([1.0, 8.0, 28.0, 56.0, 70.0, 56.0, 28.0, 8.0, 1.0]) / 256.0
 class ScreenBuffers(NamedTuple):
     """Level 0 and its pyramids, in flat pools."""
 
-    color: F32
+    color: F32_2D
     """shape (N, 3): all levels, row by row"""
-    color_level: Levels
-    depth: F32
+    color_level: I64_2D
+    depth: F32_1D
     """shape (N,): z_depth [m], nearest of each cell; level 0 is the depth itself"""
-    farthest: F32
+    farthest: F32_1D
     """shape (N,): farthest of each cell and the pixels next to it, background left out (0 where there is nothing else);
     level 0 is not used"""
-    depth_level: Levels
-    normal: F32
+    depth_level: I64_2D
+    normal: F32_3D
     """shape (H, W, 3): geometric, towards the viewer"""
 
 
@@ -45,21 +46,21 @@ class Screen(NamedTuple):
     """The buffers and the camera that filled them, for one layer of one sample: what the screen tier reads."""
 
     camera: View
-    color: F32
-    color_level: Levels
-    depth: F32
-    farthest: F32
-    depth_level: Levels
-    normal: F32
+    color: F32_2D
+    color_level: I64_2D
+    depth: F32_1D
+    farthest: F32_1D
+    depth_level: I64_2D
+    normal: F32_3D
 
 
 class BlurScratch(NamedTuple):
     """Where a colour level is on its way from the one below it: made once per picture size, of use to one thread. A
     kernel finds nothing in it and leaves nothing to be used."""
 
-    half: F32
+    half: F32_2D
     """shape (N, 3): averages of 2x2; N is the number of texels of level 1, the largest that is made"""
-    across: F32
+    across: F32_2D
     """shape (N, 3): those, blurred along the rows"""
 
 
@@ -117,7 +118,7 @@ def _average_row(source: F32, w: int, y: int, target: F32, tw: int) -> None:
 
 
 @kernel
-def blur_level(color: F32, levels: Levels, level: int, scratch: BlurScratch) -> None:
+def blur_level(color: F32_2D, levels: I64_2D, level: int, scratch: BlurScratch) -> None:
     """Make colour level `level` from the one below it."""
     half, across = scratch.half, scratch.across
     first, w, h = levels[level - 1]
@@ -144,7 +145,7 @@ def blur_level(color: F32, levels: Levels, level: int, scratch: BlurScratch) -> 
 
 
 @kernel
-def fill_depth_levels(depth: F32, farthest: F32, levels: Levels) -> None:
+def fill_depth_levels(depth: F32_1D, farthest: F32_1D, levels: I64_2D) -> None:
     """Fill every level above 0 of the two depth pyramids from level 0 of `depth`."""
     for level in range(1, levels.shape[0]):
         first, w, h = levels[level - 1]

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import EmbreeError, SceneError
+from ..kernels.arrays import F32_2D, I32_1D, I32_2D, I64_1D
 from ..kernels.compile import External, flag, inlined, word
 from ..kernels.lanes import LANES, Flags, Scalars
 from ..kernels.vec import Vec
@@ -194,15 +195,15 @@ def check_parts(points: NDArray[np.float32], parts: list[Part]) -> None:
 class Packet(NamedTuple):
     """Eight rays and their hits in Embree's own layout; one per thread."""
 
-    rays: NDArray[np.float32]
+    rays: F32_2D
     """shape (21, 8) float32, 64-byte aligned: rows ORG_X .. INST_PRIM"""
-    words: NDArray[np.int32]
+    words: I32_2D
     """the same memory as int32: MASK, PRIM, GEOM, ..."""
-    valid: NDArray[np.int32]
+    valid: I32_1D
     """shape (8,) int32: -1 traces the lane, 0 leaves it alone"""
-    arguments: NDArray[np.int32]
+    arguments: I32_1D
     """shape (8,) int32: RTCIntersectArguments"""
-    tally: NDArray[np.int64]
+    tally: I64_1D
     """shape (1,) int64: rays traced so far"""
     asked: Flags
     """`valid` as the caller of `tracing.intersect_world` set it, while it looks behind cut-outs"""

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import SceneError
+from ..kernels.arrays import F32_2D, F32_3D, F64_1D, F64_2D, I16_1D, I16_2D, I64_2D
 from ..kernels.compile import inlined, kernel
 from ..kernels.vec import Vec, transform_direction
 from ..scene import F32, F64, Environment
@@ -37,27 +38,27 @@ class EnvironmentTable(NamedTuple):
     """Arrays of one environment. Without one, the same shape of things in black."""
 
     present: bool
-    pool: F32
+    pool: F32_2D
     """shape (N, 3): radiance of every level, row by row, level after level"""
-    levels: I64
+    levels: I64_2D
     """shape (L, 3): offset into `pool`, height, width; level 0 is the map"""
-    poles: F32
+    poles: F32_3D
     """shape (L, 2, 3): radiance at +Y and -Y of the dome"""
-    dome_from_world: F64
+    dome_from_world: F64_2D
     """shape (3, 3)"""
-    irradiance_pool: F32
+    irradiance_pool: F32_2D
     """shape (32 * 64, 3): irradiance [radiance * sr] of a surface that faces the texel's direction"""
-    irradiance_poles: F32
+    irradiance_poles: F32_2D
     """shape (2, 3)"""
-    row_cdf: F64
+    row_cdf: F64_1D
     """shape (H + 1,): chance that a drawn direction lies above row i"""
-    column_cdf: F32
+    column_cdf: F32_2D
     """shape (H, W + 1): within a row, chance that it lies before column i; small, as it is read at random"""
-    row_guide: I16
+    row_guide: I16_1D
     """shape (G,): the row that chance i / G falls into, where the search for a row begins"""
-    column_guide: I16
+    column_guide: I16_2D
     """shape (H, G): the same for columns within a row"""
-    row_cosines: F64
+    row_cosines: F64_1D
     """shape (H + 1,): cosine of the angle to +Y above row i"""
 
 
@@ -193,7 +194,7 @@ def guide_of(cdf: F32 | F64) -> I16:
 
 
 @kernel
-def _copy_clean(source: F32, target: F32) -> None:
+def _copy_clean(source: F32_2D, target: F32_2D) -> None:
     """Copy rows of pixels; negative and NaN become 0, too bright ones are cut."""
     limit = np.float32(MAX_RADIANCE)
     for i in range(source.shape[0]):
@@ -203,7 +204,7 @@ def _copy_clean(source: F32, target: F32) -> None:
 
 
 @kernel
-def _resample(source: F32, target: F32) -> None:
+def _resample(source: F32_3D, target: F32_3D) -> None:
     """Mean over the solid angle of each target texel, for any two sizes."""
     height, width = source.shape[0], source.shape[1]
     rows, columns = target.shape[0], target.shape[1]
@@ -235,7 +236,7 @@ def _add_row(source: F32, weight: float, step: float, target: F32) -> None:
 
 
 @kernel
-def _convolve(source: F32, lights: F64, normals: F64, out: F32) -> None:
+def _convolve(source: F32_3D, lights: F64_2D, normals: F64_2D, out: F32_2D) -> None:
     """Irradiance for each normal: radiance times cosine over solid angle, its weights made to sum to pi."""
     height, width = source.shape[0], source.shape[1]
     for i in range(normals.shape[0]):

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..kernels.arrays import F64_1D, F64_2D, F64_3D, I32_1D, U8_1D
 from ..kernels.choice import choice
 from ..kernels.compile import inlined, leaf
 from ..kernels.vec import Vec, add, cross, dot, frame, length, lerp, normalize, row, scale, sub
@@ -38,19 +39,19 @@ _NEAREST2 = 1e-12
 class LightTable(NamedTuple):
     """One row per light."""
 
-    kind: NDArray[np.int32]
+    kind: I32_1D
     """shape (L,), as `scene.LightKind`"""
-    axes: NDArray[np.float64]
+    axes: F64_3D
     """shape (L, 4, 3): unit x, unit y, unit direction it faces (its -Z), position [m]"""
-    size: NDArray[np.float64]
+    size: F64_2D
     """shape (L, 2): Rect half width, half height [m]; Disk, Sphere radius [m]; Distant half angle [rad]"""
-    radiance: NDArray[np.float64]
+    radiance: F64_2D
     """shape (L, 3); the limit quantity where size is 0 (see `scene.Light`)"""
-    diffuse: NDArray[np.float64]
+    diffuse: F64_1D
     """shape (L,): factor of what it brings to diffuse reflection"""
-    specular: NDArray[np.float64]
+    specular: F64_1D
     """shape (L,): factor of its highlights"""
-    casts_shadow: NDArray[np.uint8]
+    casts_shadow: U8_1D
     """shape (L,)"""
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SceneError
+from ..kernels.arrays import F32_1D, F32_2D, F32_3D, I32_1D, I32_2D, I32_3D, I64_1D, I64_2D, U8_1D, U32_2D
 from ..scene import Material, Mesh, Param, Scene, Source, Sphere
 from . import embree
 from .embree import CUTOUT_MOVING, CUTOUT_STATIC, FIRST_CAPTURED_BIT, REFRACTIVE, SOLID_MOVING, SOLID_STATIC, Bvh, Part
@@ -25,59 +26,59 @@ class Geometry(NamedTuple):
 
     handle: int
     """RTCScene"""
-    points: NDArray[np.float32]
+    points: F32_2D
     """shape (V, 3) [m]"""
-    triangles: NDArray[np.uint32]
+    triangles: U32_2D
     """shape (T, 3); a sphere has one unused row"""
-    material: NDArray[np.int32]
+    material: I32_1D
     """shape (T,)"""
-    first: NDArray[np.int64]
+    first: I64_1D
     """shape (G,): row of a part's first primitive"""
-    sphere: NDArray[np.float32]
+    sphere: F32_2D
     """shape (G, 4): centre, radius [m]; radius 0 for triangles"""
-    thing: NDArray[np.int32]
+    thing: I32_1D
     """shape (G,): index of the prim, meshes first, then spheres"""
-    sheet: NDArray[np.uint8]
+    sheet: U8_1D
     """shape (G,): 1 where the surface is open, so that both of its sides face the air"""
-    normals: NDArray[np.float32]
+    normals: F32_3D
     """shape (N, 3, 3): corner normals"""
-    first_normal: NDArray[np.int64]
+    first_normal: I64_1D
     """shape (G,): row of a part's first corner normals; -1 is flat"""
-    primvars: NDArray[np.float32]
+    primvars: F32_1D
     """flat pool"""
-    primvar_first: NDArray[np.int64]
+    primvar_first: I64_2D
     """shape (G, S): offset into the pool; -1 where the part has no such primvar"""
-    primvar_stride: NDArray[np.int64]
+    primvar_stride: I64_2D
     """shape (G, S): floats from one triangle to the next; 0 where constant"""
-    primvar_size: NDArray[np.int64]
+    primvar_size: I64_2D
     """shape (G, S): floats per value"""
 
 
 class MaterialTable(NamedTuple):
     """One row per material, one column per `Param`."""
 
-    value: NDArray[np.float32]
+    value: F32_3D
     """shape (M, I, 4)"""
-    texture: NDArray[np.int32]
-    channel: NDArray[np.int32]
-    wrap: NDArray[np.int32]
+    texture: I32_2D
+    channel: I32_2D
+    wrap: I32_3D
     """shape (M, I, 2)"""
-    scale: NDArray[np.float32]
-    bias: NDArray[np.float32]
-    uv_slot: NDArray[np.int32]
-    uv_value: NDArray[np.float32]
-    uv_matrix: NDArray[np.float32]
-    primvar_slot: NDArray[np.int32]
-    driven: NDArray[np.int32]
+    scale: F32_3D
+    bias: F32_3D
+    uv_slot: I32_2D
+    uv_value: F32_3D
+    uv_matrix: F32_3D
+    primvar_slot: I32_2D
+    driven: I32_1D
     """shape (M,): bit i is set where a texture or primvar drives input i"""
-    model: NDArray[np.int32]
+    model: I32_1D
     """shape (M,), as `scene.Model`"""
-    specular_workflow: NDArray[np.uint8]
-    presence: NDArray[np.uint8]
-    threshold: NDArray[np.float32]
-    cutout: NDArray[np.uint8]
-    absorption_distance: NDArray[np.float32]
-    abbe: NDArray[np.float32]
+    specular_workflow: U8_1D
+    presence: U8_1D
+    threshold: F32_1D
+    cutout: U8_1D
+    absorption_distance: F32_1D
+    abbe: F32_1D
 
 
 class World(NamedTuple):

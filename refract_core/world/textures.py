@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..images.srgb import srgb_decode, srgb_encode
+from ..kernels.arrays import BOOL_1D, F32_2D, F32_3D, I32_1D, I64_3D, U8_2D, U8_3D
 from ..kernels.compile import kernel, leaf
 from ..scene import F32, Texture, Wrap
 
@@ -35,19 +36,19 @@ _BLACK, _CLAMP, _REPEAT, _MIRROR = int(Wrap.BLACK), int(Wrap.CLAMP), int(Wrap.RE
 class TextureTable(NamedTuple):
     """All textures of a scene."""
 
-    bytes_pool: NDArray[np.uint8]
+    bytes_pool: U8_2D
     """shape (N, 4): texels of every 8-bit level, row by row from the top"""
-    float_pool: F32
+    float_pool: F32_2D
     """shape (M, 4): texels of every float level, linear"""
-    levels: NDArray[np.int64]
+    levels: I64_3D
     """shape (T, MAX_LEVELS, 3): first texel in the pool, width, height of each level"""
-    counts: NDArray[np.int32]
+    counts: I32_1D
     """shape (T,): number of levels"""
-    is_float: NDArray[np.bool_]
+    is_float: BOOL_1D
     """shape (T,): which pool"""
-    srgb: NDArray[np.int32]
+    srgb: I32_1D
     """shape (T,): row of `decode` for RGB (alpha uses row 0)"""
-    decode: F32
+    decode: F32_2D
     """shape (2, 256): value of a byte, linear (row 0) and sRGB-encoded (row 1)"""
 
 
@@ -143,7 +144,7 @@ def _share(cover: tuple[int, float, float, float], tap: int) -> float:
 
 
 @kernel
-def _halve_floats(finer: F32, coarser: F32) -> None:
+def _halve_floats(finer: F32_3D, coarser: F32_3D) -> None:
     """Fill `coarser` with the mean of what each of its texels covers. Shapes (H, W, 4) and (H/2, W/2, 4)."""
     for y in range(coarser.shape[0]):
         rows = _cover(y, finer.shape[0])
@@ -161,7 +162,7 @@ def _halve_floats(finer: F32, coarser: F32) -> None:
 
 
 @kernel
-def _halve_bytes(finer: NDArray[np.uint8], decode: F32, curve: int, coarser: F32) -> None:
+def _halve_bytes(finer: U8_3D, decode: F32_2D, curve: int, coarser: F32_3D) -> None:
     """As `_halve_floats`, from bytes to linear light."""
     for y in range(coarser.shape[0]):
         rows = _cover(y, finer.shape[0])
@@ -179,7 +180,7 @@ def _halve_bytes(finer: NDArray[np.uint8], decode: F32, curve: int, coarser: F32
 
 
 @kernel
-def _encode(linear: F32, encode_words: NDArray[np.uint8], curve: int, out: NDArray[np.uint8]) -> None:
+def _encode(linear: F32_3D, encode_words: U8_2D, curve: int, out: U8_3D) -> None:
     """Linear light in [0, 1] to bytes; alpha stays linear."""
     for y in range(out.shape[0]):
         for x in range(out.shape[1]):
