@@ -131,11 +131,12 @@ def test_optics_of_arrays_need_no_numba(built: Path) -> None:
     program = """
 from refract_core.optics import arrays
 n, i = [0.0, 0.0, 1.0], [0.6, 0.0, -0.8]
-print(arrays.reflect(i, n).round(12).tolist(), arrays.refract(i, n, 1.5).ok, arrays.fresnel_dielectric(1.0, 1.5).round(9))
+print(arrays.reflect(i, n).round(12).tolist(), arrays.refract(i, n, 1.5).ok)
+print(arrays.fresnel_dielectric(1.0, 1.5).round(9))
 arrays.transmittance([0.5, 0.5, 0.5], 1.0, 2.0)
 arrays.sphere_model([0, 0, 0], n, n, 1.5, 1.0), arrays.box_model([0, 0, 0], n, n, 1.5, 1.0), arrays.refract_node(i, n)
 """
-    assert run(FORBID + program, built) == "[0.6, 0.0, 0.8] True 0.04\n"
+    assert run(FORBID + program, built) == "[0.6, 0.0, 0.8] True\n0.04\n"
 
 
 # --- never stale
