@@ -180,8 +180,8 @@ def test_a_present_share_is_the_same_share_everywhere(opacity: float) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_steep_normals_send_no_ray_to_the_wrong_side(seed: int) -> None:
-    """Corner normals up to 60 degrees off, on glass seen directly and through a slab: where Snell's law by the shading
-    normal would send light back out of the face it goes in by, or back in where it leaves, the true normal decides."""
+    """Corner normals up to 60 degrees off, on glass seen directly and through a slab: where Snell's law or a mirror by
+    the shading normal would leave light on the wrong side of a face, the true normal decides."""
     walls, materials = position_room()
     rng = np.random.default_rng(seed)
     slab = box("/slab", (1.5, 1.5, 0.05), 1, centre=(0, 0, 1.2))

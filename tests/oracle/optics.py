@@ -73,10 +73,9 @@ class Split(NamedTuple):
 
 
 def entering(d: Vec, n: Vec, ng: Vec, ior: float) -> Split:
-    """From air into glass. `n` (shading) and `ng` stand outward. A steep normal must not send the ray back out."""
+    """From air into glass. `n` (shading) and `ng` stand outward. However steep `n` is, the ray goes in: it is a sum of
+    `d` and of -`n`, both of which do, with weights that no ior above 1 makes negative."""
     through = bent(d, n, 1.0 / ior)
-    if through is None or dot(through, ng) >= 0.0:
-        through = bent(d, ng, 1.0 / ior)
     return Split(through, _kept(mirrored(d, n), d, ng, 1.0), fresnel(clamp(-dot(d, n)), ior))
 
 
