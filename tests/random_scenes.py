@@ -278,7 +278,8 @@ class _Builder:
 def _lights(dice: Dice) -> tuple[Light, ...]:
     lights = []
     for _ in range(dice.pick([1, 1, 2, 3])):
-        kind = dice.pick(list(LightKind))
+        # The camera's light is a kind for kernels; a scene asks for it by `camera_light`.
+        kind = dice.pick([kind for kind in LightKind if kind is not LightKind.CAMERA])
         place = np.array([dice.number(-1.5, 1.5), dice.number(1.2, 2.5), dice.number(-1.0, 2.0)])
         sizes = {LightKind.DISTANT: (dice.pick([0.0, 0.02, 0.2]), 0.0), LightKind.RECT: (dice.number(0.2, 1.0), 0.4)}
         size = sizes.get(kind, (dice.pick([0.0, 0.15, 0.4]), 0.0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -11,10 +12,12 @@ from numpy.typing import NDArray
 from scenes import (
     box,
     camera,
+    constant_room,
     draw,
     glass,
     material,
     position_room,
+    quad,
     scene,
     shell,
     trace_mesh,
@@ -162,3 +165,19 @@ def test_a_mesh_turned_inside_out_harms_no_other_glass() -> None:
     assert ((both["mask"] > 0) & ~here).mean() > 0.05
     for name in ("beauty", "layers", "mask", "path_length"):
         np.testing.assert_array_equal(both[name][here], alone[name][here], err_msg=name)
+
+
+def test_a_pane_absorbs_the_same_seen_directly_and_on_the_way_of_a_ray() -> None:
+    """Behind clear glass of ior 1 it is met by a walk. Its colour holds for one crossing: at 60 degrees and n = 1.5 the
+    way inside is 1 / cos(t) as long, cos(t)^2 = 1 - 0.75 / 2.25 (Snell)."""
+    walls, materials = constant_room()
+    turn = turned((0, 1, 0), 60)
+    corners = np.array([(-2, -2, 0), (2, -2, 0), (2, 2, 0), (-2, 2, 0)]) @ turn.T
+    pane = quad("/pane", corners, 1)
+    slab = box("/slab", (1, 1, 0.1), 2, centre=(0, 0, 1.8))
+    kinds = [*materials, glass(Model.THIN, 1.5, TRANSMITTANCE=0.5), glass(Model.TRACED, 1.0)]
+    expected = 0.5 ** (1.0 / math.sqrt(1.0 - 0.75 / 2.25))
+    eye = camera(fov=0.02, orthographic=True)
+    for things in ([pane], [pane, slab]):
+        planes = draw(scene([*walls, *things], kinds, cameras=(eye,)), 9, 9, tiers=("ray", "sky"))
+        np.testing.assert_allclose(planes["transmittance"][4, 4], expected, rtol=1e-4)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -188,3 +189,27 @@ def test_glass_is_left_out_of_mirrors() -> None:
     with_glass = scene([*walls, mirror], [*materials, chrome, glass(Model.TRACED)], [ball])
     without = scene([*walls, mirror], [*materials, chrome])
     np.testing.assert_array_equal(draw(with_glass)["beauty"], draw(without)["beauty"])
+
+
+@pytest.mark.parametrize("base", [0.0, 0.5])
+def test_a_coat_has_no_highlight_in_the_shadow(base: float) -> None:
+    """Under a roof, of a light without a diffuse share; a polished base has no highlight to ask a shadow for."""
+    floor = quad("/floor", [(-2, 0, 2), (2, 0, 2), (2, 0, -2), (-2, 0, -2)], 0)
+    roof = quad("/roof", [(-2, 0.5, 2), (2, 0.5, 2), (2, 0.5, -2), (-2, 0.5, -2)], 1)
+    lamp = replace(light(LightKind.SPHERE, (0, 3, -2), (0, -1, 0), (0.3, 0.0), 50.0), diffuse=0.0)
+    coated = material("/coated", ROUGHNESS=base, IOR=1.5, CLEARCOAT=1.0, CLEARCOAT_ROUGHNESS=0.6)
+    eye = camera((0, 0.4, 1.5), (0, 0, 0.0), 0.2)
+    planes = draw(scene([floor, roof], [coated, material("/roof")], lights=(lamp,), cameras=(eye,)), 8, 8)
+    assert planes["beauty"][4, 4, :3].max() == 0.0
+
+
+@pytest.mark.parametrize("channel", [Channel.R, Channel.G, Channel.B, Channel.A])
+def test_one_channel_of_a_picture_drives_a_colour(channel: Channel) -> None:
+    """UsdUVTexture: scale and bias act on the channels, then one of them is picked, and is grey as a colour."""
+    values, scale, bias = (0.5, 0.25, 0.75, 1.0), (1.0, 0.4, 2.0, 0.5), (0.0, 0.1, 0.0, 0.3)
+    picture = Texture("picture", np.tile(np.array(values, np.float32), (2, 2, 1)))
+    driven = material("/wall", EMISSIVE=Source(texture=0, channel=channel, scale=scale, bias=bias))
+    wall = quad("/wall", [(-2, -2, 0), (2, -2, 0), (2, 2, 0), (-2, 2, 0)], 0)
+    planes = draw(scene([wall], [driven], textures=(picture,)), 8, 8)
+    expected = values[channel] * scale[channel] + bias[channel]
+    np.testing.assert_allclose(planes["beauty"][4, 4, :3], expected, rtol=1e-6)

@@ -31,9 +31,15 @@ def _enter(n: Vec, wo: Vec, ior: float) -> tuple[Vec, Vec, float, float, float]:
     dense = max(ior, 1.0)
     facing = flip_towards(n, wo)
     cos_i = min(dot(facing, wo), 1.0)
-    cos_t = math.sqrt(max(1.0 - (1.0 - cos_i * cos_i) / (dense * dense), 0.0))
+    cos_t = cosine_inside(cos_i, dense)
     inside = along(scale(wo, -1.0 / dense), facing, cos_i / dense - cos_t)
     return facing, inside, cos_i, cos_t, dense
+
+
+@inlined
+def cosine_inside(cos_i: float, ior: float) -> float:
+    """Cosine under which light goes on that came in under `cos_i`, 0 .. 1, from vacuum (Snell); ior >= 1."""
+    return math.sqrt(max(1.0 - (1.0 - cos_i * cos_i) / (ior * ior), 0.0))
 
 
 @inlined

@@ -16,7 +16,17 @@ from ..kernels.compile import inlined
 from ..kernels.lanes import LANES, Flags, Scalars, Vectors, Words, put
 from ..kernels.vec import Vec, along, dot, flip_towards, mul, normalize, row, scale, sub
 from ..optics.interface import reflect, refract, transmittance
-from ..optics.models import WALL, absorption_distance_of, exit_of, is_sheet, is_walked, on_open_mesh, thickness_of
+from ..optics.models import (
+    BOX_MIN_COS,
+    WALL,
+    absorption_distance_of,
+    cosine_inside,
+    exit_of,
+    is_sheet,
+    is_walked,
+    on_open_mesh,
+    thickness_of,
+)
 from ..scene import Model, Param
 from ..world.embree import (
     COHERENT,
@@ -249,7 +259,9 @@ def _meet(exits: Exits, lane: int, world: World) -> None:
         if inside >= 0:
             _absorb(exits, lane, hit.t)
         elif is_sheet(model) or sheet[hit.part] != 0:
-            cosine = max(1e-3, abs(dot(at.ng, d)))
+            # The ray is not bent on its way, but what it loses is what it would lose bent: the slant inside counts.
+            ior = max(1.0, float_input(world, at, Param.IOR.value))
+            cosine = max(BOX_MIN_COS, cosine_inside(abs(dot(at.ng, d)), ior))
             tint = color_input(world, at, Param.TRANSMITTANCE.value)
             through = transmittance(tint, WALL, WALL / cosine)
             put(exits.transmittance, lane, mul(row(exits.transmittance, lane), through))

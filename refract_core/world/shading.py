@@ -175,7 +175,8 @@ def _gather_lights(block: Block, packet: Packet, world: World, sample: int, mask
             block.lamp_diffuse[lane] = irradiance_factor(lights, l, p, n) * lights.diffuse[l]
             gloss = block.roughness[lane]
             block.lamp_specular[lane] = highlight(lights, l, p, n, wo, gloss * gloss) * lights.specular[l]
-            arrives = block.lamp_diffuse[lane] + block.lamp_specular[lane] > 0.0
+            # A clear coat has a highlight of its own, where the rest of the surface may have none.
+            arrives = block.lamp_diffuse[lane] + block.lamp_specular[lane] > 0.0 or block.coat[lane] > 0.0
             if arrives and lights.casts_shadow[l] != 0:
                 u1, u2 = unit_pair(key_of(block.key, lane), sample, Purpose.LIGHT.value + l)
                 direction, distance = shadow_ray(lights, l, p, u1, u2)

@@ -270,6 +270,10 @@ def _driven_color(world: World, at: Interaction, i: int) -> Vec:
     value = materials.value[m, i]
     if materials.texture[m, i] >= 0:
         c = _textured(world, at, i)
+        channel = materials.channel[m, i]
+        if channel <= Channel.A.value:  # one channel drives all three colours, scaled and biased as that channel
+            x = c[0] * materials.scale[m, i, channel] + materials.bias[m, i, channel]
+            return (x, x, x)
     elif materials.primvar_slot[m, i] >= 0:
         found, c = _primvar4(world.geometry, at.hit, materials.primvar_slot[m, i])
         if not found:
@@ -286,26 +290,13 @@ def float_input(world: World, at: Interaction, i: int) -> float:
     materials, m = world.materials, at.hit.material
     if (materials.driven[m] >> i) & 1 == 0:
         return np.float64(materials.value[m, i, 0])
-    return _driven_float(world, at, i)
+    return _driven_color(world, at, i)[0]
 
 
 @inlined
 def share_input(world: World, at: Interaction, i: int) -> float:
     """A scalar input that is a share, brought into 0 .. 1: textures and primvars may hold anything."""
     return min(1.0, max(0.0, float_input(world, at, i)))
-
-
-@inlined
-def _driven_float(world: World, at: Interaction, i: int) -> float:
-    materials, m = world.materials, at.hit.material
-    channel = materials.channel[m, i]
-    if materials.texture[m, i] >= 0 and channel == Channel.A.value:
-        c = _textured(world, at, i)
-        return c[3] * materials.scale[m, i, 3] + materials.bias[m, i, 3]
-    if materials.texture[m, i] >= 0 and channel < Channel.A.value:
-        c = _textured(world, at, i)
-        return c[0] * materials.scale[m, i, channel] + materials.bias[m, i, channel]
-    return _driven_color(world, at, i)[0]
 
 
 @inlined

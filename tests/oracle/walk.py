@@ -6,6 +6,7 @@ through, back where it does not. A tree would take both, by `Split.reflectance`.
 
 from __future__ import annotations
 
+import math
 from enum import Enum
 from typing import NamedTuple
 
@@ -167,9 +168,10 @@ class Walk:
         self.point = hit.point
 
     def _through_pane(self, hit: Hit) -> Vec:
-        """What a thin pane on the way leaves: it is crossed straight."""
-        cosine = max(1e-3, abs(dot(hit.ng, self.direction)))
+        """What a thin pane on the way leaves: as long a way as a bent ray has inside, though it is crossed straight."""
         material = self.scene.materials[hit.face.material]
+        ior = max(1.0, number(self.scene, hit, material, Param.IOR))
+        cosine = max(1e-5, math.sqrt(1.0 - (1.0 - dot(hit.ng, self.direction) ** 2) / ior**2))
         return absorbed(color(self.scene, hit, material, Param.TRANSMITTANCE), optics.THIN, optics.THIN / cosine)
 
     def _absorb(self, length: float) -> None:
