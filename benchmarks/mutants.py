@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
@@ -140,15 +141,20 @@ MUTANTS = (
 
 def mutated(folder: Path, mutant: Mutant) -> None:
     """A copy of the project with the mutant in it. Raises LookupError where its place is not there exactly once."""
+    copied(folder)
+    check(mutant, folder)
+    path = folder / "refract_core" / mutant.file
+    path.write_text(path.read_text("utf-8").replace(mutant.before, mutant.after), "utf-8")
+
+
+def copied(folder: Path) -> None:
+    """A copy of the project as it is."""
     for name in COPIED:
         source = ROOT / name
         if source.is_dir():
             shutil.copytree(source, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
         elif source.exists():
             shutil.copy(source, folder / name)
-    check(mutant, folder)
-    path = folder / "refract_core" / mutant.file
-    path.write_text(path.read_text("utf-8").replace(mutant.before, mutant.after), "utf-8")
 
 
 def check(mutant: Mutant, root: Path = ROOT) -> None:
@@ -165,14 +171,19 @@ def killer(mutant: Mutant) -> tuple[str, float]:
     with tempfile.TemporaryDirectory(prefix="refract-mutant-") as name:
         folder = Path(name)
         mutated(folder, mutant)
-        tests = [test for test in mutant.tests if (folder / test).exists()]
-        environment = {**os.environ, "PYTHONPATH": name, "PYTHONDONTWRITEBYTECODE": "1"}
-        command = [sys.executable, "-m", "pytest", "-x", "-q", "--no-header", "-p", "no:cacheprovider", *tests]
-        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
-    found = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
+        failed = first_failure(folder, mutant.tests)
+    return failed, time.perf_counter() - start
+
+
+def first_failure(folder: Path, tests: Iterable[str]) -> str:
+    """The first test that fails in a copy; '' for none. Raises RuntimeError where the tests cannot run."""
+    environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "--no-header", "-p", "no:cacheprovider", *tests]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
     if done.returncode not in (0, 1):
-        raise RuntimeError(f"mutant '{mutant.name}': pytest ended with {done.returncode}:\n{done.stdout[-2000:]}")
-    return (found[0].split(" - ")[0].split("::")[-1] if found else ""), time.perf_counter() - start
+        raise RuntimeError(f"pytest ended with {done.returncode}:\n{done.stdout[-2000:]}")
+    found = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
+    return found[0].split(" - ")[0].split("::")[-1] if found else ""
 
 
 def main() -> int:
@@ -188,6 +199,11 @@ def main() -> int:
             print(f"{mutant.file:24s} {mutant.name}")
     if options.list:
         return 0
+    with tempfile.TemporaryDirectory(prefix="refract-mutant-") as name:
+        copied(Path(name))
+        if failed := first_failure(Path(name), dict.fromkeys(test for mutant in chosen for test in mutant.tests)):
+            print(f"{failed} fails without any mutant; mend that first")
+            return 1
     alive = 0
     with ThreadPoolExecutor(options.jobs) as threads:
         for mutant, (test, seconds) in zip(chosen, threads.map(killer, chosen), strict=True):
