@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -34,7 +35,7 @@ def possible() -> str:
 
 
 def on_what_is_built(test: Any) -> Any:
-    """A test of kernels that were compiled ahead of time, which takes half a minute once."""
+    """A test of the kernels in a wheel, whose making takes half a minute."""
     return pytest.mark.slow(pytest.mark.skipif(bool(possible()), reason=possible() or "it can")(test))
 
 
@@ -47,26 +48,10 @@ def run(program: str, root: Path, **variables: str) -> str:
     return ended.stdout
 
 
-@pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the package with its kernels in it, as a wheel installs it."""
-    root = tmp_path_factory.mktemp("built")
-    for name in ("refract_core", "schemas"):
-        shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
-    if ahead.state()[0]:
-        return root
-    command = [sys.executable, "-P", "-m", "refract_core.kernels.build"]
-    environment = {**os.environ, "PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"}
-    ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=900)
-    assert ended.returncode == 0, ended.stderr
-    assert f"{len(build.kernels())} kernels" in ended.stdout
-    return root
-
-
 @pytest.fixture
-def copy(built: Path, tmp_path: Path) -> Path:
-    """Another such copy, to be spoilt."""
-    shutil.copytree(built, tmp_path / "copy")
+def copy(site: Path, tmp_path: Path) -> Path:
+    """A copy of the wheel's contents, to be spoilt."""
+    shutil.copytree(site, tmp_path / "copy")
     return tmp_path / "copy"
 
 
@@ -100,11 +85,18 @@ def rendering(out: Path, names: tuple[str, ...], tiers: tuple[str, ...]) -> str:
 
 
 @on_what_is_built
+def test_a_wheel_has_kernels_and_its_name_says_for_whom(site: Path) -> None:
+    assert run(STATE, site) == f"{len(build.kernels())} \n"
+    (wheel,) = site.parent.glob("*.whl")
+    assert re.search(r"-py3-none-(manylinux_2_\d+|linux)_x86_64\.whl$", wheel.name)
+
+
+@on_what_is_built
 @pytest.mark.parametrize("tiers", [("screen", "probe", "sky"), ("ray", "sky")])
-def test_pictures_are_those_of_numba_bit_by_bit(tiers: tuple[str, ...], built: Path, tmp_path: Path) -> None:
+def test_pictures_are_those_of_numba_bit_by_bit(tiers: tuple[str, ...], site: Path, tmp_path: Path) -> None:
     names = ("marble", "glass_behind_glass", "two_probes", "planar_table", "thickness_map", "traced")
-    run(FORBID + rendering(tmp_path / "ahead.npz", names, tiers), built)
-    run(rendering(tmp_path / "numba.npz", names, tiers) + "assert 'numba' in sys.modules", built, REFRACT_KERNELS="jit")
+    run(FORBID + rendering(tmp_path / "ahead.npz", names, tiers), site)
+    run(rendering(tmp_path / "numba.npz", names, tiers) + "assert 'numba' in sys.modules", site, REFRACT_KERNELS="jit")
     ours, theirs = np.load(tmp_path / "ahead.npz"), np.load(tmp_path / "numba.npz")
     assert set(ours.files) == set(theirs.files)
     assert [plane for plane in ours.files if ours[plane].tobytes() != theirs[plane].tobytes()] == []
@@ -120,14 +112,14 @@ def test_pictures_are_those_of_numba_bit_by_bit(tiers: tuple[str, ...], built: P
         ("render", "IN/glass_behind_glass.usda", "OUT/picture.exr", "--image-width", "32", "--screen", "proxy"),
     ],
 )
-def test_no_verb_needs_numba(words: tuple[str, ...], built: Path, tmp_path: Path) -> None:
+def test_no_verb_needs_numba(words: tuple[str, ...], site: Path, tmp_path: Path) -> None:
     given = [w.replace("OUT", str(tmp_path)).replace("IN", str(STAGES)) for w in words]
     program = f"{FORBID}\nfrom refract_core.cli import app\napp({given!r}, standalone_mode=False)"
-    run(program, built)
+    run(program, site)
 
 
 @on_what_is_built
-def test_optics_of_arrays_need_no_numba(built: Path) -> None:
+def test_optics_of_arrays_need_no_numba(site: Path) -> None:
     program = """
 from refract_core.optics import arrays
 n, i = [0.0, 0.0, 1.0], [0.6, 0.0, -0.8]
@@ -136,7 +128,7 @@ print(arrays.fresnel_dielectric(1.0, 1.5).round(9))
 arrays.transmittance([0.5, 0.5, 0.5], 1.0, 2.0)
 arrays.sphere_model([0, 0, 0], n, n, 1.5, 1.0), arrays.box_model([0, 0, 0], n, n, 1.5, 1.0), arrays.refract_node(i, n)
 """
-    assert run(FORBID + program, built) == "[0.6, 0.0, 0.8] True\n0.04\n"
+    assert run(FORBID + program, site) == "[0.6, 0.0, 0.8] True\n0.04\n"
 
 
 # --- never stale
@@ -188,15 +180,15 @@ def test_an_older_processor_means_numba(copy: Path, tmp_path: Path) -> None:
 
 
 @on_what_is_built
-def test_the_environment_may_ask_for_numba(built: Path) -> None:
-    assert run(STATE, built, REFRACT_KERNELS="jit") == "0 REFRACT_KERNELS is jit\n"
+def test_the_environment_may_ask_for_numba(site: Path) -> None:
+    assert run(STATE, site, REFRACT_KERNELS="jit") == "0 REFRACT_KERNELS is jit\n"
     program = "from refract_core.errors import UsageError\ntry:\n    exec(STATE)\nexcept UsageError as e:\n    print(e)"
-    said = run(program.replace("STATE", repr(STATE)), built, REFRACT_KERNELS="no")
+    said = run(program.replace("STATE", repr(STATE)), site, REFRACT_KERNELS="no")
     assert said == "REFRACT_KERNELS is 'no'; write jit, or leave it out\n"
 
 
 @on_what_is_built
-def test_other_arguments_are_numbas_business(built: Path) -> None:
+def test_other_arguments_are_numbas_business(site: Path) -> None:
     """A layout, a type or a number of axes that the kernel was not compiled for; and what may be read both ways is."""
     program = """
 import sys
@@ -217,7 +209,7 @@ assert "numba" not in sys.modules
 assert added(np.float64, (1, 0, 4, 2)) == 24.0
 assert "numba" in sys.modules
 """
-    run(program, built)
+    run(program, site)
 
 
 # --- signatures
