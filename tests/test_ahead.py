@@ -169,6 +169,12 @@ def test_object_and_manifest_are_of_one_build(copy: Path) -> None:
 
 
 @on_what_is_built
+def test_a_damaged_object_means_numba(copy: Path) -> None:
+    (copy / "refract_core" / "kernels" / "built" / ahead.OBJECT).write_bytes(b"not machine code")
+    assert run(STATE, copy).startswith("0 kernels.so cannot be loaded: ")
+
+
+@on_what_is_built
 def test_an_older_processor_means_numba(copy: Path, tmp_path: Path) -> None:
     """The shared object says itself whether it runs here."""
     folder = copy / "refract_core" / "kernels" / "built"

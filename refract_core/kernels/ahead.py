@@ -56,7 +56,10 @@ def state() -> tuple[dict[str, Any], str]:
     manifest = json.loads((FOLDER / MANIFEST).read_text("utf-8"))
     if changed := [name for name, digest in manifest["sources"].items() if digest_of(ENGINE / name) != digest]:
         return {}, f"{changed[0]} is not what the kernels were compiled from"
-    library = ctypes.CDLL(str(FOLDER / OBJECT))
+    try:
+        library = ctypes.CDLL(str(FOLDER / OBJECT))
+    except OSError as error:  # damaged, or on a disk that nothing may be run from
+        return {}, f"{OBJECT} cannot be loaded: {error}"
     if ctypes.string_at(ctypes.addressof(ctypes.c_char.in_dll(library, "refract_key"))).decode() != manifest["key"]:
         return {}, f"{OBJECT} and {MANIFEST} are not of one build"
     if not library.refract_runs_here():
