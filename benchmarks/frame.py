@@ -85,7 +85,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=1)
     parser.add_argument("--repeat", type=int, default=7)
     parser.add_argument("--jobs", type=int, default=0)
-    parser.add_argument("--tiers", default="screen,probe,sky")
+    parser.add_argument("--tiers", default=",".join(rc.RenderSettings().tiers))
     arguments = parser.parse_args()
     jobs = arguments.jobs or os.cpu_count() or 1
     options = ["--image-width", arguments.width, "--image-height", arguments.height, "--samples", arguments.samples,

@@ -262,10 +262,10 @@ NORMALS = shown("Balls") + hidden("Sheet")
 NEAR_WALL = over("Pane", "double3 xformOp:translate = (0, 1.2, -1.75)\nfloat3 xformOp:rotateXYZ = (0, 40, 0)")
 FIGURES: Mapping[str, tuple[Panel, ...] | Callable[[Path], RGB]] = {
     "hierarchy": (
-        Panel("marble.usda", tiers=("screen", "probe", "sky")),
-        Panel("marble.usda", tiers=("screen", "probe", "sky"), show="tiers"),
-        Panel("marble.usda", tiers=("screen", "sky"), show="tiers"),
-        Panel("marble.usda", tiers=("screen",), show="tiers"),
+        Panel("two_probes.usda", tiers=("screen", "probe", "sky")),
+        Panel("two_probes.usda", tiers=("screen", "probe", "sky"), show="tiers"),
+        Panel("two_probes.usda", tiers=("screen", "sky"), show="tiers"),
+        Panel("two_probes.usda", tiers=("screen",), show="tiers"),
     ),
     "mode": tuple(
         room(f'uniform token probe:mode = "{mode}"\n{given}', time_code=12.0)

@@ -331,7 +331,7 @@ class Scene:
     lights: tuple[Light, ...] = ()
     environment: Environment | None = None
     camera_light: bool = False
-    """The stage has no light at all: one shines from the camera, as in usdrecord."""
+    """The stage has no light, no dome and nothing that glows: one shines from the camera, as in usdrecord."""
     cameras: tuple[Camera, ...] = ()
     """Every camera of the stage, by path; the reader puts the one it would choose first."""
     probes: tuple[Probe, ...] = ()

@@ -26,7 +26,7 @@ class RenderSettings:
     """[pixels]; 0 follows the camera's aspect."""
     samples: int = 4
     """Samples per pixel, 1 .. 4096."""
-    tiers: tuple[str, ...] = ("screen", "probe", "sky")
+    tiers: tuple[str, ...] = ("screen", "probe", "ray", "sky")
     """Order in which refraction and reflection look for their colour."""
     screen: str = "march"
     """`march` the opaque depth, or `proxy` exactly as HDRP."""
@@ -37,6 +37,8 @@ class RenderSettings:
     exposure: float = 0.0
     """Stops added to the camera's own exposure, -64 .. 64."""
     purposes: tuple[str, ...] = ("default", "render")
+    camera_light: bool = True
+    """Light from the camera where a stage has no light, no dome and nothing that glows."""
     jobs: int = 0
     """Threads; 0 means all cores."""
     tile_size: int = 64

@@ -57,6 +57,7 @@ class Render(StageOnly):
     model: Model | None = None
     max_layers: Annotated[int, Field(ge=1, le=32)] | None = None
     exposure: Annotated[float, Field(ge=-64.0, le=64.0)] | None = None
+    camera_light: bool | None = None
     purposes: Annotated[list[Purpose], Field(min_length=1, max_length=4), _Once] | None = None
     time_code: Annotated[float, Field(ge=-1e9, le=1e9)] | None = None
     aovs: Annotated[list[Aov], Field(max_length=17), _Once] | None = None

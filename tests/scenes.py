@@ -15,7 +15,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import refract_core as rc
-from refract_core.scene import Camera, Environment, Light, LightKind, Material, Mesh, Model, Param, Source, Sphere, Wrap
+from refract_core.scene import (
+    Camera,
+    Environment,
+    Light,
+    LightKind,
+    Material,
+    Mesh,
+    Model,
+    Param,
+    Probe,
+    Source,
+    Sphere,
+    Volume,
+    Wrap,
+)
 from refract_core.scene import Texture as Picture
 
 F64 = NDArray[np.float64]
@@ -167,6 +181,12 @@ def light(
 def dome(radiance: float) -> Environment:
     """An environment of one radiance."""
     return Environment(np.full((16, 32, 3), radiance, np.float32))
+
+
+def surrounding() -> Probe:
+    """A probe at the middle of a room whose influence and proxy are the room."""
+    room = Volume(np.eye(4), False, (ROOM, ROOM, ROOM))
+    return Probe("/probe", "realtime", (0.0, 0.0, 0.0), room, room, resolution=64, clipping=(0.01, 100.0))
 
 
 def scene(

@@ -108,7 +108,7 @@ def test_without_flags_the_defaults_are_rendered(engine: Engine, tmp_path: Path)
 
 def test_every_flag_reaches_its_setting(engine: Engine, tmp_path: Path) -> None:
     words = "--camera /Cam -w 40 --image-height 30 --samples 9 --tiers ray,sky --screen proxy --model box "
-    words += "--max-layers 2 --purposes guide,default --exposure -1.5 --jobs 2 --tile-size 32 "
+    words += "--max-layers 2 --purposes guide,default --exposure -1.5 --disable-camera-light --jobs 2 --tile-size 32 "
     words += "--render-settings-prim-path /Render/A"
     assert refract("render", "a.usda", tmp_path / "a.png", *words.split()).code == 0
     assert engine.settings == [
@@ -122,6 +122,7 @@ def test_every_flag_reaches_its_setting(engine: Engine, tmp_path: Path) -> None:
             model="box",
             max_layers=2,
             exposure=-1.5,
+            camera_light=False,
             purposes=("default", "guide"),
             jobs=2,
             tile_size=32,

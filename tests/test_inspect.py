@@ -197,9 +197,9 @@ def test_probes_and_what_they_cover(tmp_path: Path) -> None:
     said = report(tmp_path, text + probe.format("realtime"))
     assert [(p["covers"], p["texture"]) for p in said["probes"]] == [(["/In"], "realtime")]
     tiers = {piece["path"]: piece["tiers"] for piece in said["glass"]}
-    assert tiers == {"/In": ["screen", "probe"], "/Out": ["screen"]}
+    assert tiers == {"/In": ["screen", "probe", "ray"], "/Out": ["screen", "ray"]}
     assert [entry["path"] for entry in said["suspicious"]] == ["/Out"]
-    assert report(tmp_path, text)["glass"][1]["tiers"] == ["screen", "probe"]  # no probe at all: each has its own
+    assert report(tmp_path, text)["glass"][1]["tiers"] == ["screen", "ray"]  # none is invented
     for mode, state in (("baked", "none"), ("custom", "missing")):
         assert report(tmp_path, text + probe.format(mode))["probes"][0]["texture"] == state
 

@@ -55,7 +55,7 @@ def prepared(what: Scene, samples: int = 1) -> Session:
     """Capture the probes of a scene as a picture would."""
     chosen = RenderSettings(samples=samples, tiers=("probe", "sky"), jobs=1)
     with ThreadPoolExecutor(1) as executor:
-        return prepare(what, what.cameras[0], chosen, 64, Work(executor, lambda _f, _s: None, lambda: False))
+        return prepare(what, what.cameras[0], chosen, Work(executor, lambda _f, _s: None, lambda: False))
 
 
 @kernel

@@ -22,6 +22,7 @@ from scenes import (
     position_room,
     quad,
     scene,
+    surrounding,
     turned,
     view_rays,
     wall_hit,
@@ -105,7 +106,8 @@ def test_glass_of_ior_one_is_not_there_for_a_probe() -> None:
 def test_white_furnace(model: Model, settings: dict[str, Any]) -> None:
     """Clear glass in a room of one radiance is invisible: what Fresnel takes from one direction comes from another."""
     walls, materials = constant_room(0.75)
-    what = scene([*walls, CUBE], [*materials, glass(model)], [replace(BALL, centre=(0.5, 0.4, -0.8))])
+    balls = [replace(BALL, centre=(0.5, 0.4, -0.8))]
+    what = scene([*walls, CUBE], [*materials, glass(model)], balls, probes=(surrounding(),))
     picture = draw(what, **settings)
     assert picture["mask"].mean() > 0.1
     np.testing.assert_allclose(picture["beauty"][..., :3], 0.75, atol=1e-4)

@@ -342,6 +342,24 @@ def test_the_camera_light_shines_only_where_there_is_no_light_at_all() -> None:
     assert not read(BALL + 'def DomeLight "L" { token visibility = "invisible" }').camera_light
 
 
+@pytest.mark.parametrize(("glow", "lit"), [("(0, 0, 0)", True), ("(0, 0.5, 0)", False)])
+def test_the_camera_light_does_not_shine_on_what_glows(glow: str, lit: bool) -> None:
+    """A lamp at the eye burns a sun into every sphere of a room that is lit by its own walls."""
+    bound = """
+    def Material "M" {
+        token outputs:surface.connect = </M/S.outputs:out>
+        def Shader "S" {
+            uniform token info:id = "UsdPreviewSurface"
+            color3f inputs:emissiveColor = GLOW
+            token outputs:out
+        }
+    }
+    def Cube "Wall" (prepend apiSchemas = ["MaterialBindingAPI"]) { rel material:binding = </M> }
+    """
+    assert read(BALL + bound.replace("GLOW", glow)).camera_light is lit
+    assert read(BALL + bound.replace("GLOW", glow).replace("</M>", "</N>")).camera_light  # bound to nothing
+
+
 # --- real stages ----------------------------------------------------------------------------------------------------
 
 REFUSED = {"framesPerSecond_-1.usda", "framesPerSecond_0.usda"}

@@ -45,7 +45,7 @@ Tiers = Annotated[
     typer.Option(
         metavar="LIST",
         help="Where refraction and reflection look for their colour, in this order, out of screen, ray, probe and "
-        "sky. The default is screen,probe,sky.",
+        "sky. The default is screen,probe,ray,sky.",
     ),
 ]
 Screen = Annotated[
@@ -105,6 +105,13 @@ ColorCorrection = Annotated[
     ),
 ]
 Exposure = Annotated[float | None, typer.Option(help="Stops of light added to the camera's own exposure.")]
+DisableCameraLight = Annotated[
+    bool,
+    typer.Option(
+        "--disable-camera-light",
+        help="Add no light where the stage has none. Without it one shines from the camera if nothing else shines.",
+    ),
+]
 SettingsPrim = Annotated[
     str,
     typer.Option(
@@ -143,6 +150,7 @@ def render(
     complexity: Complexity = "low",
     color_correction_mode: ColorCorrection = "sRGB",
     exposure: Exposure = None,
+    disable_camera_light: DisableCameraLight = False,
     render_settings_prim_path: SettingsPrim = "",
     jobs: Jobs = None,
     executor: Executor = "",
@@ -162,6 +170,7 @@ def render(
         "max_layers": max_layers,
         "purposes": None if purposes is None else _purposes(purposes),
         "exposure": exposure,
+        "camera_light": False if disable_camera_light else None,
         "jobs": jobs,
         "tile_size": tile_size,
     }

@@ -46,8 +46,6 @@ class ProbeTable(NamedTuple):
     eye: F64_2D
     """shape (K, 4): the camera in the influence volume's frame, homogeneous: a point [m] and 1, or for an orthographic
     camera the direction towards it and 0"""
-    owned: U8_1D
-    """shape (K,): 1 where it serves only the things that are given to it"""
     reach: Reach
     """of the influence volumes of those that serve everything"""
     influence: F64_3D
@@ -97,7 +95,7 @@ def bounds_of(probe: Probe) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return m[:3, 3] - half, m[:3, 3] + half
 
 
-def empty_table(probes: list[Probe], owned: list[bool], camera: Camera, rough: bool) -> ProbeTable:
+def empty_table(probes: list[Probe], drawn: list[bool], camera: Camera, rough: bool) -> ProbeTable:
     """A table with room for every level of every probe; `capture` fills the texels."""
     count = len(probes)
     faces = [WINDOW if p.planar else CUBE for p in probes]
@@ -120,7 +118,7 @@ def empty_table(probes: list[Probe], owned: list[bool], camera: Camera, rough: b
 
     inverse = each(lambda p: np.linalg.inv(p.influence.world_from_volume), np.float64, (4, 4))
     bounds = np.array([bounds_of(p) for p in probes], np.float64).reshape(count, 2, 3)
-    bounds[np.array(owned, bool)] = np.inf  # out of everybody's reach
+    bounds[~np.array(drawn, bool)] = np.inf  # out of everybody's reach
     return ProbeTable(
         texels=np.zeros(total, np.float32),
         first=first,
@@ -129,7 +127,6 @@ def empty_table(probes: list[Probe], owned: list[bool], camera: Camera, rough: b
         planar=each(lambda p: p.planar, np.uint8),
         capture=each(lambda p: p.capture_point, np.float64, (3,)),
         eye=np.ascontiguousarray(inverse @ towards),
-        owned=np.array(owned, np.uint8),
         reach=reach_of(bounds[:, 0], bounds[:, 1]),
         influence=inverse,
         influence_sphere=each(lambda p: p.influence.sphere, np.uint8),

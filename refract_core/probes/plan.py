@@ -1,8 +1,9 @@
 """Which probes serve a picture, decided before the BVH is built, because what they see is marked in it.
 
-A stage's own probes come in HDRP's order; those that cannot reach any glass are left out. Where the stage has none,
-glass gets its own: captured at its centre, with the scene's bounds as proxy (Arm's preparation steps: stand in the
-object, hide it, draw six faces).
+Only probes that the stage authors are drawn, in HDRP's order; those that cannot reach any glass are left out. None is
+invented: a picture taken at the centre of a glass knows nothing of what stands around it where nothing does, or where
+the centre lies inside a candle. Glass that no probe reaches has no probe tier; what it still needs under `--screen
+proxy` is a volume to guess distances by, and gets one that shows nothing.
 """
 
 from __future__ import annotations
@@ -18,10 +19,7 @@ from ..world.embree import FIRST_CAPTURED_BIT, OPAQUE, OPAQUE_STATIC
 from ..world.tables import prim_of
 from .lookup import bounds_of, camera_weight
 
-_MAX_OWN = 8
-"""Glass beyond this many things shares capture points with its neighbours."""
 _MAX_SETS = 31 - FIRST_CAPTURED_BIT
-_EVERYWHERE = 1e9  # half size of an influence without limits [m]
 
 Box = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -30,8 +28,6 @@ class Entry(NamedTuple):
     """One probe of the picture."""
 
     probe: Probe
-    owned: bool
-    """it serves only the things that `Plan.thing_probe` gives it"""
     mask: int
     """what it sees"""
     drawn: bool
@@ -43,7 +39,7 @@ class Plan(NamedTuple):
 
     entries: list[Entry]
     thing_probe: NDArray[np.int32]
-    """shape (things,): the entry whose proxy serves a thing, -1 for opaque things"""
+    """shape (things,): the entry whose proxy serves a thing, -1 for none"""
     captured_sets: list[frozenset[str] | None]
     notices: tuple[Notice, ...] = ()
 
@@ -62,30 +58,32 @@ def plan_capture(scene: Scene, probes: list[Probe]) -> Plan:
     """A plan that draws these probes, whatever they serve."""
     sets: list[frozenset[str] | None] = []
     notices: list[Notice] = []
-    entries = [Entry(probe, False, _mask_of(scene, probe, sets, notices), True) for probe in probes]
+    entries = [Entry(probe, _mask_of(scene, probe, sets, notices), True) for probe in probes]
     return Plan(entries, np.full(len(scene.meshes) + len(scene.spheres), -1, np.int32), sets, tuple(notices))
 
 
-def plan_picture(scene: Scene, camera: Camera, height: int, wanted: bool) -> Plan:
+def plan_picture(scene: Scene, camera: Camera, *, drawn: bool, proxies: bool) -> Plan:
     """Choose the probes of a picture.
 
     Args:
-        height: of the picture [pixels], to which the resolution of own probes is fitted.
-        wanted: something is going to ask for probes.
+        drawn: the probe tier is going to be asked.
+        proxies: the screen tier is going to guess by proxies, of which every piece of glass needs one.
     """
     glass = _glass(scene)
     thing_probe = np.full(len(scene.meshes) + len(scene.spheres), -1, np.int32)
-    if not wanted or not glass:
+    if not (drawn or proxies) or not glass:
         return Plan([], thing_probe, [])
     serving = [p for p in in_order(list(scene.probes)) if _serves(p, camera, glass, scene)]
     plan = plan_capture(scene, serving)
-    entries = plan.entries
+    entries = [entry._replace(drawn=drawn) for entry in plan.entries]
     for k, entry in reversed(list(enumerate(entries))):
         for thing, (low, high) in glass.items():
             if contains(entry.probe.influence, (low + high) / 2):
                 thing_probe[thing] = k
-    alone = {thing: box for thing, box in glass.items() if thing_probe[thing] < 0}
-    _add_own(entries, alone, thing_probe, scene, height, drawn=not scene.probes)
+    for thing, box in glass.items() if proxies else ():
+        if thing_probe[thing] < 0:
+            thing_probe[thing] = len(entries)
+            entries.append(Entry(_bare_proxy(box if scene.probes else scene.bounds), 0, False))
     return plan._replace(entries=entries, thing_probe=thing_probe)
 
 
@@ -161,40 +159,14 @@ def contains(volume: Volume, point: NDArray[np.float64]) -> bool:
     return bool((np.abs(p) <= np.array(volume.extents)).all())
 
 
-def _add_own(
-    entries: list[Entry], alone: dict[int, Any], thing_probe: NDArray[np.int32], scene: Scene, height: int, drawn: bool
-) -> None:
-    """Give every thing in `alone` a probe at its centre; many things share the nearest of a few, spread widely."""
-    if not alone:
-        return
-    things = sorted(alone, key=lambda thing: -float(np.prod(alone[thing][1] - alone[thing][0] + 1e-9)))
-    centres = np.array([(alone[thing][0] + alone[thing][1]) / 2 for thing in things])
-    chosen = [0]
-    while len(chosen) < min(_MAX_OWN, len(things)):
-        away = np.min(np.linalg.norm(centres[:, None] - centres[chosen][None], axis=2), axis=1)
-        chosen.append(int(np.argmax(away)))
-    nearest = np.argmin(np.linalg.norm(centres[:, None] - centres[chosen][None], axis=2), axis=1)
-    base = len(entries)
-    for i in chosen:
-        proxy = scene.bounds if drawn else tuple(tuple(side) for side in alone[things[i]])
-        entries.append(Entry(_own_probe(centres[i], proxy, height), True, int(OPAQUE), drawn))
-    for thing, group in zip(things, nearest, strict=True):
-        thing_probe[thing] = base + group
-
-
-def _own_probe(centre: NDArray[np.float64], proxy: Any, height: int) -> Probe:
-    low, high = np.array(proxy[0], np.float64), np.array(proxy[1], np.float64)
+def _bare_proxy(box: Any) -> Probe:
+    """A box to guess distances by, from low to high corner [m]: HDRP's default proxy where no probe is near (its page
+    'Create a refractive Material'). It is never drawn and never asked."""
+    low, high = np.array(box[0], np.float64), np.array(box[1], np.float64)
     frame = np.eye(4)
     frame[:3, 3] = (low + high) / 2
     half = np.maximum((high - low) / 2, 1e-3) * 1.0005
-    here = np.eye(4)
-    here[:3, 3] = centre
-    return Probe(
-        path="",
-        mode="realtime",
-        capture_point=(float(centre[0]), float(centre[1]), float(centre[2])),
-        influence=Volume(here, False, (_EVERYWHERE,) * 3),
-        proxy=Volume(frame, False, (float(half[0]), float(half[1]), float(half[2]))),
-        resolution=1 << min(9, max(5, round(math.log2(max(height, 1) / 5)))),
-        clipping=(1e-4, 1e9),
-    )
+    volume = Volume(frame, False, (float(half[0]), float(half[1]), float(half[2])))
+    centre = (float(frame[0, 3]), float(frame[1, 3]), float(frame[2, 3]))
+    return Probe("", "realtime", centre, influence=volume, proxy=volume, resolution=1)
+

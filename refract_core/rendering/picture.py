@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import Executor
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,12 +56,14 @@ def render(
         Cancelled: `cancel` said so.
     """
     settings = settings or RenderSettings()
+    if not settings.camera_light:
+        scene = replace(scene, camera_light=False)
     camera = choose_camera(scene, settings.camera)
     width, height = image_size(camera, settings.image_width, settings.image_height)
     with working(executor, settings.jobs, progress, cancel) as work:
         if not is_compiled(refract_tile):
             work.progress(0.0, COMPILING)
-        session = prepare(scene, camera, settings, height, work)
+        session = prepare(scene, camera, settings, work)
         planes, rays = _draw(session, scene, camera, settings, (width, height), work)
         work.progress(1.0, "done")
     metadata: dict[str, str | float] = {
@@ -74,8 +77,14 @@ def render(
         "refract:metersPerUnit": scene.metres_per_unit,
         "refract:rays": float(rays + session.rays),
     }
-    notices = scene.notices + open_meshes(scene, settings.model) + session.notices
+    notices = scene.notices + camera_light(scene) + open_meshes(scene, settings.model) + session.notices
     return Frame(width, height, planes, metadata, notices)
+
+
+def camera_light(scene: Scene) -> tuple[Notice, ...]:
+    """Say that a light was added that the stage does not have."""
+    text = "no light, no dome and nothing that glows, so the camera lights it; --disable-camera-light leaves that out"
+    return (Notice("/", text),) if scene.camera_light else ()
 
 
 def open_meshes(scene: Scene, model: str) -> tuple[Notice, ...]:

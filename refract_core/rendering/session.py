@@ -55,12 +55,10 @@ def choose_camera(scene: Scene, name: str) -> Camera:
     raise UsageError(f"--camera {name}: the stage has no such camera; it has {known}")
 
 
-def prepare(scene: Scene, camera: Camera, settings: RenderSettings, height: int, work: Work) -> Session:
+def prepare(scene: Scene, camera: Camera, settings: RenderSettings, work: Work) -> Session:
     """Pack tables, build the BVH, capture probes."""
-    wanted = "probe" in settings.tiers or settings.screen == "proxy"
-    chosen = plan_picture(scene, camera, height, wanted)
-    if "probe" not in settings.tiers:  # their proxies may still serve the screen tier
-        chosen = chosen._replace(entries=[entry._replace(drawn=False) for entry in chosen.entries])
+    proxies = "screen" in settings.tiers and settings.screen == "proxy"
+    chosen = plan_picture(scene, camera, drawn="probe" in settings.tiers, proxies=proxies)
     samples = min(settings.samples, _PROBE_SAMPLES)
     return _prepare(scene, camera, chosen, is_rough(scene), samples, work, (0.1, 0.2))
 
@@ -79,7 +77,7 @@ def _prepare(
         )
     )
     entries = chosen.entries
-    table = empty_table([e.probe for e in entries], [e.owned for e in entries], camera, rough)
+    table = empty_table([e.probe for e in entries], [e.drawn for e in entries], camera, rough)
 
     def run(function: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
         return work.run(

@@ -172,7 +172,7 @@ def _ask_screen(query: Query, lane: int, asking: Asking, by_proxy: bool) -> None
 
 @inlined
 def _ask_probes(query: Query, lane: int, asking: Asking, by_proxy: bool, world: World, sky_follows: bool) -> None:
-    """Every probe that reaches the ray's origin, in order; then the one that is the thing's own."""
+    """Every probe that reaches the ray's origin, in order."""
     probes = asking.probes
     p = row(query.origin, lane)
     cuts, sets = probes.reach.cuts, probes.reach.sets
@@ -181,9 +181,6 @@ def _ask_probes(query: Query, lane: int, asking: Asking, by_proxy: bool, world: 
     while k >= 0 and _headroom(query, lane) > 1.0 - _SPENT:
         _ask_probe(query, lane, k, by_proxy, probes, world, sky_follows)
         k = next_of(sets, i, j, l, k + 1)
-    own = asking.thing_probe[query.thing[lane]]
-    if own >= 0 and probes.owned[own] != 0 and _headroom(query, lane) > 1.0 - _SPENT:
-        _ask_probe(query, lane, own, by_proxy, probes, world, sky_follows)
 
 
 @inlined

@@ -14,7 +14,7 @@ import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdLux
 
 from ..errors import StageError, UsageError
-from ..scene import F64, Mesh, Notice, Scene, Sphere
+from ..scene import F64, Material, Mesh, Notice, Param, Scene, Sphere
 from .camera import choose_camera, read_cameras
 from .diagnostics import captured, words_of
 from .geometry.parts import Bound, Part, Tables, assemble, bind
@@ -175,6 +175,7 @@ def _read(
     cameras = choose_camera(stage, time, read_cameras(stage, time, **frame), camera, bounds, notices)
     lights, environment = read_lights(stage, time, purposes=purposes, **frame)
     every = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
+    lit = any(prim.HasAPI(UsdLux.LightAPI) for prim in every) or _glows(tables, meshes, spheres)
     return Scene(
         meshes=meshes,
         materials=tuple(tables.materials),
@@ -182,7 +183,7 @@ def _read(
         textures=tuple(tables.textures.values()),
         lights=lights,
         environment=environment,
-        camera_light=not any(prim.HasAPI(UsdLux.LightAPI) for prim in every),
+        camera_light=not lit,
         cameras=cameras,
         probes=read_probes(stage, time, read_cubemap=read_cubemap, **frame),
         bounds=bounds,
@@ -191,6 +192,18 @@ def _read(
         time_code=float(time.GetValue()),
         name=stage.GetRootLayer().realPath or stage.GetRootLayer().identifier,
     )
+
+
+def _glows(tables: Tables, meshes: tuple[Mesh, ...], spheres: tuple[Sphere, ...]) -> bool:
+    """Something that is drawn emits light: its emissive colour is not black, or a picture or primvar drives it."""
+
+    def emits(material: Material) -> bool:
+        source = material.inputs[Param.EMISSIVE]
+        driven = source.texture >= 0 or source.primvar
+        return max(source.scale[:3]) > 0.0 or max(source.bias[:3]) > 0.0 if driven else max(source.value[:3]) > 0.0
+
+    used = {int(m) for mesh in meshes for m in np.unique(mesh.materials)} | {ball.material for ball in spheres}
+    return any(emits(tables.materials[m]) for m in used)
 
 
 def _drawn(placed: list[Placed], centre: F64) -> tuple[tuple[Mesh, ...], tuple[Sphere, ...]]:

@@ -133,11 +133,11 @@ def _ior(source: Source) -> Report:
 
 
 def _tiers(seen: Overview, reached: bool) -> list[str]:
-    """Tiers that have something to say. Where a stage has no probe at all, each piece of glass gets its own."""
+    """Tiers that have something to say."""
     able = {
         "screen": True,
         "ray": True,
-        "probe": reached or not seen.scene.probes,
+        "probe": reached,
         "sky": seen.scene.environment is not None,
     }
     return [tier for tier in seen.settings.tiers if able[tier]]
@@ -237,8 +237,7 @@ def to_text(report: Report) -> str:
         lines += _cut(_table([_HEADINGS, *map(_row, glass)]), _ROWS["glass"] + 1)
         if any(piece["by"] != API for piece in glass):
             lines.append("  * glass by its surface shader, without RefractMaterialAPI")
-    own = ", each piece of glass gets its own at every render" if glass else ""
-    lines.append(f"probes      {len(probes)}" if probes else f"probes      none{own}")
+    lines.append(f"probes      {len(probes) or 'none'}")
     lines += _cut([_of_probe(probe, len(glass)) for probe in probes], _ROWS["probes"])
     lines.append(f"unsupported {len(report['unsupported']) or 'nothing'}")
     lines += _cut([f"  {entry['path']}: {entry['text']}" for entry in report["unsupported"]], _ROWS["unsupported"])

@@ -38,6 +38,8 @@ class EnvironmentTable(NamedTuple):
     """Arrays of one environment. Without one, the same shape of things in black."""
 
     present: bool
+    dark: bool
+    """it is black all over: it covers what is behind it, and lights nothing"""
     pool: F32_2D
     """shape (N, 3): radiance of every level, row by row, level after level"""
     levels: I64_2D
@@ -83,6 +85,7 @@ def pack(environment: Environment | None) -> EnvironmentTable:
     row_cdf, column_cdf = _distribution(_level_over(pool, levels, SAMPLING_SHAPE))
     return EnvironmentTable(
         present=environment is not None,
+        dark=not pool.any(),
         pool=pool,
         levels=levels,
         poles=poles,

@@ -71,8 +71,12 @@ class Lamp(NamedTuple):
 
 
 def pack_lights(scene: Scene, eye: NDArray[np.float64]) -> LightTable:
-    """Lights of a scene; with none at all, one at the eye that lights a white surface facing it to 1."""
-    lights = [*scene.lights, *([_camera_light(eye)] if scene.camera_light else [])]
+    """Lights of a scene that shine; with none at all, one at the eye that lights a white surface facing it to 1.
+
+    A light of radiance 0 is left out: it would cost its shadow rays and bring nothing.
+    """
+    lights = [light for light in scene.lights if any(light.radiance)]
+    lights += [_camera_light(eye)] if scene.camera_light else []
     places = [light.world_from_light for light in lights]
     factors = [KINDS[light.kind].size_factor for light in lights]
     n = len(lights)

@@ -215,7 +215,7 @@ def _gather_sky(block: Block, packet: Packet, world: World, sample: int, mask: i
     seen = block.sky_seen
     for lane in range(LANES):
         seen[lane] = 1.0
-    if not environment.present:
+    if not environment.present or environment.dark:
         return
     clear(packet)
     for lane in range(LANES):

@@ -48,7 +48,7 @@ const copyOf = (settings) => structuredClone(settings);
 const PRESETS = {
   model: [{ model: "sphere" }, { model: "traced" }],
   screen: [{ screen: "march" }, { screen: "proxy" }],
-  tiers: [{ tiers: ["screen", "probe", "sky"] }, { tiers: ["ray", "sky"] }],
+  tiers: [{ tiers: ["screen", "probe", "ray", "sky"] }, { tiers: ["ray", "sky"] }],
   layers: [{}, { max_layers: 1 }],
 };
 

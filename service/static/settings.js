@@ -10,7 +10,7 @@ export function defaultSettings(facts) {
   const authored = facts?.settings ?? {};
   return {
     camera: "", time_code: null, image_width: 480, image_height: 0, samples: authored.samples ?? 4, exposure: 0,
-    tiers: [...(authored.tiers ?? ["screen", "probe", "sky"])], screen: "march", model: "",
+    tiers: [...(authored.tiers ?? ["screen", "probe", "ray", "sky"])], screen: "march", model: "",
     max_layers: authored.max_layers ?? 4, overrides: {},
   };
 }

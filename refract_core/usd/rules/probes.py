@@ -111,8 +111,8 @@ def _solids_at(scene: Scene, point: F64) -> Iterator[tuple[str, Callable[[F64], 
 
 def _outside(piece: Glass) -> Finding:
     """Glass that no probe reaches."""
-    text = "no probe's influence reaches this glass, so what the screen does not show comes from the sky"
-    fix = "make a probe's influence larger, add a RefractProbe here, or render with --tiers screen,ray,sky"
+    text = "no probe's influence reaches this glass, so what the screen does not show comes from a ray, or the sky"
+    fix = "make a probe's influence larger, or add a RefractProbe here, if a probe is to answer"
     return OUTSIDE.broken(piece.path, text, fix)
 
 

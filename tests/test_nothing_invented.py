@@ -1,0 +1,75 @@
+"""What the program adds by itself goes wrong somewhere: no probe, no lamp, no light where the stage says enough."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import checker_room, draw, glass, light, material, quad, scene, shell
+
+import refract_core as rc
+from refract_core.scene import Environment, LightKind, Model, Sphere
+
+TIERS = rc.RenderSettings().tiers
+BALL = Sphere("/ball", (0.0, 0.0, 0.0), 0.6, 0)
+F0 = 0.04  # ((1.5 - 1) / (1.5 + 1))^2
+
+
+@pytest.mark.parametrize("model", [Model.SPHERE, Model.BOX, Model.TRACED])
+def test_glass_alone_is_not_a_black_blob(model: Model) -> None:
+    """A product without a stage around it: nobody knows what is behind, so the picture is left open there. A probe at
+    its centre, which saw nothing, would answer black with full weight."""
+    planes = draw(scene([], [glass(model)], [BALL]), 33, 33, tiers=TIERS)
+    assert planes["weight.none"][16, 16] == 1.0
+    np.testing.assert_allclose(planes["beauty"][16, 16, 3], F0, atol=1e-3)
+    assert planes["beauty"][16, 16, :3].max() == 0.0
+
+
+def test_what_stands_in_hollow_glass_is_seen() -> None:
+    """A candle in its holder: the holder's centre lies inside the candle, where a probe would see nothing."""
+    walls, materials, textures = checker_room()
+    holder = shell("/holder", 0.8, 0.7, 6, 24)
+    candle = Sphere("/candle", (0.0, 0.0, 0.0), 0.35, 7)
+    glow = material("/candle", EMISSIVE=(0.9, 0.6, 0.2))
+    what = scene([*walls, holder], [*materials, glass(Model.TRACED), glow], [candle], textures=textures)
+    seen, truth = draw(what, tiers=TIERS), draw(what, tiers=("ray", "sky"))
+    np.testing.assert_allclose(seen["beauty"][32, 32, :3], np.array([0.9, 0.6, 0.2]) * (1.0 - F0), rtol=0.05)
+    inside = truth["mask"] > 0
+    assert np.abs(seen["beauty"] - truth["beauty"])[inside][:, :3].mean() < 0.05  # the march guesses at outlines
+
+
+def test_a_light_of_no_radiance_changes_nothing_and_costs_no_ray() -> None:
+    floor = quad("/floor", [(-2, -1, 2), (2, -1, 2), (2, -1, -2), (-2, -1, -2)], 0)
+    lamp = light(LightKind.RECT, (0, 2, 0), (0, -1, 0), (1.0, 1.0), 2.0)
+    dark = replace(lamp, radiance=(0.0, 0.0, 0.0))
+    settings = rc.RenderSettings(image_width=32, image_height=32, samples=1, jobs=1)
+
+    def frame(*lights: object) -> rc.Frame:
+        return rc.render(scene([floor], [material("/grey", DIFFUSE=0.5)], lights=tuple(lights)), settings)
+
+    one, both = frame(lamp), frame(lamp, dark)
+    np.testing.assert_array_equal(one.planes["beauty"], both.planes["beauty"])
+    assert one.metadata["refract:rays"] == both.metadata["refract:rays"]
+
+
+def test_a_black_dome_covers_and_lights_nothing() -> None:
+    floor = quad("/floor", [(-2, -1, 2), (2, -1, 2), (2, -1, -2), (-2, -1, -2)], 0)
+    settings = rc.RenderSettings(image_width=32, image_height=32, samples=1, jobs=1)
+    black = Environment(np.zeros((4, 8, 3), np.float32))
+    one = rc.render(scene([floor], [material("/grey", DIFFUSE=0.5)]), settings)
+    two = rc.render(scene([floor], [material("/grey", DIFFUSE=0.5)], environment=black), settings)
+    assert one.metadata["refract:rays"] == two.metadata["refract:rays"]
+    np.testing.assert_array_equal(one.planes["beauty"][..., :3], two.planes["beauty"][..., :3])
+    assert (two.planes["beauty"][..., 3] == 1.0).all()
+
+
+def test_the_camera_light_is_said_and_can_be_left_out() -> None:
+    wall = quad("/wall", [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], 0)
+    what = scene([wall], [material("/grey", DIFFUSE=0.5)], camera_light=True)
+    on = rc.render(what, rc.RenderSettings(image_width=8, image_height=8, samples=1, jobs=1))
+    off = rc.render(what, rc.RenderSettings(image_width=8, image_height=8, samples=1, jobs=1, camera_light=False))
+    assert [n.text for n in on.notices if "--disable-camera-light" in n.text]
+    assert on.planes["beauty"][4, 4, :3].min() > 0.1
+    assert not off.notices
+    assert off.planes["beauty"][..., :3].max() == 0.0
