@@ -16,13 +16,25 @@ BALL = Sphere("/ball", (0.0, 0.0, 0.0), 0.6, 0)
 F0 = 0.04  # ((1.5 - 1) / (1.5 + 1))^2
 
 
-@pytest.mark.parametrize("model", [Model.SPHERE, Model.BOX, Model.TRACED])
+@pytest.mark.parametrize("model", [Model.SPHERE, Model.BOX, Model.THIN, Model.TRACED])
 def test_glass_alone_is_not_a_black_blob(model: Model) -> None:
     """A product without a stage around it: nobody knows what is behind, so the picture is left open there. A probe at
     its centre, which saw nothing, would answer black with full weight."""
     planes = draw(scene([], [glass(model)], [BALL]), 33, 33, tiers=TIERS)
-    assert planes["weight.none"][16, 16] == 1.0
-    np.testing.assert_allclose(planes["beauty"][16, 16, 3], F0, atol=1e-3)
+    walls = 2 if model is Model.THIN else 1  # a thin ball is met on its far side again
+    np.testing.assert_allclose(planes["weight.none"][16, 16], (1.0 - F0) ** (walls - 1), atol=1e-3)
+    np.testing.assert_allclose(planes["beauty"][16, 16, 3], 1.0 - (1.0 - F0) ** walls, atol=1e-3)
+    assert planes["beauty"][16, 16, :3].max() == 0.0
+
+
+@pytest.mark.parametrize("roughness", [0.0, 0.4])
+def test_several_walls_of_glass_alone_stay_open(roughness: float) -> None:
+    """Four surfaces behind one another and nothing else: what the nearest cannot answer the next one cannot either, so
+    more walls never make the picture more opaque than what they reflect, F0 for each at most."""
+    panes = [quad(f"/pane{k}", [(-1, -1, -k), (1, -1, -k), (1, 1, -k), (-1, 1, -k)], 0) for k in range(4)]
+    planes = draw(scene(panes, [glass(Model.THIN, ROUGHNESS=roughness)]), 33, 33, tiers=TIERS)
+    assert planes["layers"][16, 16] == 4
+    np.testing.assert_allclose(planes["beauty"][16, 16, 3], 1.0 - (1.0 - F0) ** 4, atol=0.01)
     assert planes["beauty"][16, 16, :3].max() == 0.0
 
 

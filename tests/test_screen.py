@@ -179,11 +179,11 @@ def test_blurring_keeps_a_constant_and_spreads_a_spot() -> None:
     """Weights sum to 1 on every level; a spot in the middle keeps its energy (each level has a quarter the texels)."""
     levels = color_levels(64, 64, True)
     for value in ("constant", "spot"):
-        color = np.zeros((int((levels[:, 1] * levels[:, 2]).sum()), 3), np.float32)
+        color = np.zeros((int((levels[:, 1] * levels[:, 2]).sum()), 4), np.float32)
         if value == "constant":
             color[: 64 * 64] = 0.7
         else:
-            color[:4096].reshape(64, 64, 3)[30:34, 30:34] = 1.0
+            color[:4096].reshape(64, 64, 4)[30:34, 30:34] = 1.0
         for k in range(1, 3):
             blur_level(color, levels, k, by_address(new_blur_scratch(levels)))
             first, w, h = levels[k]
@@ -191,15 +191,15 @@ def test_blurring_keeps_a_constant_and_spreads_a_spot() -> None:
             if value == "constant":
                 np.testing.assert_allclose(level, 0.7, rtol=1e-5)
             else:
-                assert level.sum() / 3 == pytest.approx(16 / 4**k, rel=1e-3)
+                assert level.sum() / 4 == pytest.approx(16 / 4**k, rel=1e-3)
                 assert level.max() < 1.0
 
 
 def test_what_is_left_in_the_working_memory_of_a_blur_does_not_show() -> None:
     """Levels of an odd size made in memory full of NaN, and again in what that left."""
     levels = color_levels(37, 21, True)
-    color = np.zeros((int((levels[:, 1] * levels[:, 2]).sum()), 3), np.float32)
-    color[: 37 * 21] = np.random.default_rng(5).random((37 * 21, 3))
+    color = np.zeros((int((levels[:, 1] * levels[:, 2]).sum()), 4), np.float32)
+    color[: 37 * 21] = np.random.default_rng(5).random((37 * 21, 4))
     work = new_blur_scratch(levels)
     work.half[:] = work.across[:] = np.nan
     made = []

@@ -44,10 +44,9 @@ class Layered:
         self.blurring = by_address(new_blur_scratch(self.screen.color_level))
         # The opaque layer is level 0 of the screen's pyramids.
         self.opaque = OpaqueLayer(
-            self.screen.color[: width * height].reshape(height, width, 3),
+            self.screen.color[: width * height].reshape(height, width, 4),
             self.screen.depth[: width * height].reshape(height, width),
             self.screen.normal,
-            np.zeros((height, width), np.float32),
         )
         self.layers = [new_refractive_layer(width, height)]
         self.result = new_layer_result(width, height)

@@ -49,8 +49,7 @@ class LayerResult(NamedTuple):
     """A composited layer before it is put into the picture. float32, written only where the layer is."""
 
     color: F32_3D
-    """shape (H, W, 3): radiance of the pixel with this layer in front"""
-    alpha: F32_2D
+    """shape (H, W, 4): radiance of the pixel with this layer in front, premultiplied by coverage, and coverage"""
     depth: F32_2D
     """shape (H, W) z_depth [m]"""
     normal: F32_3D
@@ -60,8 +59,7 @@ class LayerResult(NamedTuple):
 def new_layer_result(width: int, height: int) -> LayerResult:
     """Planes of zeros."""
     return LayerResult(
-        np.zeros((height, width, 3), np.float32),
-        np.zeros((height, width), np.float32),
+        np.zeros((height, width, 4), np.float32),
         np.zeros((height, width), np.float32),
         np.zeros((height, width, 3), np.float32),
     )
@@ -80,7 +78,7 @@ def put_tile(
                 opaque.color[y, x, c] = result.color[y, x, c]
                 opaque.normal[y, x, c] = result.normal[y, x, c]
             opaque.depth[y, x] = result.depth[y, x]
-            opaque.alpha[y, x] = max(opaque.alpha[y, x], result.alpha[y, x])
+            opaque.color[y, x, 3] = result.color[y, x, 3]
 
 
 @inlined
@@ -290,7 +288,7 @@ def _composite(
                 planes.reflection[y, x, c] += reflection
                 if sample == 0:
                     planes.normal[y, x, c] = block.ns[lane, c]
-        result.alpha[y, x] = 1.0 - exits.unanswered[lane] * clear_share
+        result.color[y, x, 3] = 1.0 - exits.unanswered[lane] * clear_share
         result.depth[y, x] = query.z_self[lane]
         if front and sample == 0:
             planes.z_depth[y, x] = query.z_self[lane]

@@ -107,6 +107,20 @@ def _add(query: Query, lane: int, tier: int, color: Vec, weight: float, confiden
 
 
 @inlined
+def _add_covered(
+    query: Query, lane: int, tier: int, color: Vec, coverage: float, weight: float, confidence: float
+) -> None:
+    """The same for a picture that is open in places: its colour carries the coverage, and only the covered share of the
+    weight is used up. What is left goes to the next tier, or is told as nobody's."""
+    for c in range(3):
+        query.color[lane, c] += color[c] * weight
+    answered = weight * coverage
+    query.weight[lane, tier] += answered
+    query.weight[lane, NONE] -= answered
+    query.confidence[lane] += answered * confidence
+
+
+@inlined
 def _headroom(query: Query, lane: int) -> float:
     """Weight that no tier has answered yet."""
     return query.weight[lane, NONE]
@@ -167,7 +181,7 @@ def _ask_screen(query: Query, lane: int, asking: Asking, by_proxy: bool) -> None
     else:
         color, w, confidence = screen_march(screen, ray)
     _, w = update_headroom(1.0 - _headroom(query, lane), w)
-    _add(query, lane, SCREEN, color, w, confidence)
+    _add_covered(query, lane, SCREEN, (color[0], color[1], color[2]), color[3], w, confidence)
 
 
 @inlined
@@ -195,14 +209,8 @@ def _ask_probe(
     light, coverage, fits, confidence = probe_light(
         probes, k, ray, by_proxy, world.environment, sky_follows and world.environment.present
     )
-    # The colour carries its own coverage; only the covered share of the weight is used up.
     _, w = update_headroom(1.0 - _headroom(query, lane), w * fits)
-    for c in range(3):
-        query.color[lane, c] += light[c] * w
-    w *= coverage
-    query.weight[lane, PROBE] += w
-    query.weight[lane, NONE] -= w
-    query.confidence[lane] += w * confidence
+    _add_covered(query, lane, PROBE, light, coverage, w, confidence)
 
 
 @inlined

@@ -53,13 +53,12 @@ class OpaqueLayer(NamedTuple):
     """What the camera would see without refractive objects. One sample per pixel."""
 
     color: F32_3D
-    """shape (H, W, 3) radiance; the environment where nothing was hit"""
+    """shape (H, W, 4): radiance, premultiplied by coverage, and coverage. Surfaces cover, and so does a visible
+    environment where nothing was hit; else the picture is open there"""
     depth: F32_2D
     """shape (H, W) z_depth [m]; inf where nothing was hit"""
     normal: F32_3D
     """shape (H, W, 3): geometric normal on the camera's side"""
-    alpha: F32_2D
-    """shape (H, W): 1 on surfaces and on a visible environment, else 0"""
 
 
 class RefractiveLayer(NamedTuple):
@@ -213,14 +212,14 @@ def _write_opaque(layer: OpaqueLayer, block: Block, world: World, view: View, x0
                 layer.color[y, x, c] = block.color[lane, c]
                 layer.normal[y, x, c] = block.ng[lane, c]
             layer.depth[y, x] = block.distance[lane] * cosine
-            layer.alpha[y, x] = 1.0
+            layer.color[y, x, 3] = 1.0
             continue
         layer.depth[y, x] = math.inf
         sky = radiance(world.environment, direction, 0.0) if world.environment.present else (0.0, 0.0, 0.0)
         for c in range(3):
             layer.color[y, x, c] = sky[c]
             layer.normal[y, x, c] = 0.0
-        layer.alpha[y, x] = 1.0 if world.environment.present else 0.0
+        layer.color[y, x, 3] = 1.0 if world.environment.present else 0.0
 
 
 @kernel

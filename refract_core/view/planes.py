@@ -150,6 +150,5 @@ def add_tile(planes: Planes, opaque: OpaqueLayer, size: I64_1D, tile: Tile) -> N
     """Add a finished sample's picture (the opaque layer, its glass drawn in) to the beauty. `size`: width, height."""
     for y in range(tile[1], min(tile[3], size[1])):
         for x in range(tile[0], min(tile[2], size[0])):
-            for c in range(3):
+            for c in range(4):
                 planes.beauty[y, x, c] += opaque.color[y, x, c]
-            planes.beauty[y, x, 3] += opaque.alpha[y, x]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..kernels.arrays import F32_1D, F32_2D, F32_3D, I64_2D
 from ..kernels.compile import inlined, kernel
-from ..kernels.vec import Vec
+from ..world.textures import Rgba
 from .camera import View
 
 F32 = NDArray[np.float32]
@@ -30,7 +30,8 @@ class ScreenBuffers(NamedTuple):
     """Level 0 and its pyramids, in flat pools."""
 
     color: F32_2D
-    """shape (N, 3): all levels, row by row"""
+    """shape (N, 4): radiance, premultiplied by coverage, and coverage (0 where the picture is open); all levels, row by
+    row"""
     color_level: I64_2D
     depth: F32_1D
     """shape (N,): z_depth [m], nearest of each cell; level 0 is the depth itself"""
@@ -59,9 +60,9 @@ class BlurScratch(NamedTuple):
     kernel finds nothing in it and leaves nothing to be used."""
 
     half: F32_2D
-    """shape (N, 3): averages of 2x2; N is the number of texels of level 1, the largest that is made"""
+    """shape (N, 4): averages of 2x2; N is the number of texels of level 1, the largest that is made"""
     across: F32_2D
-    """shape (N, 3): those, blurred along the rows"""
+    """shape (N, 4): those, blurred along the rows"""
 
 
 def color_levels(width: int, height: int, blurred: bool) -> Levels:
@@ -90,7 +91,7 @@ def new_screen_buffers(w: int, h: int, blurred: bool) -> ScreenBuffers:
         return int((levels[:, 1] * levels[:, 2]).sum())
 
     return ScreenBuffers(
-        np.zeros((total(colors), 3), np.float32),
+        np.zeros((total(colors), 4), np.float32),
         colors,
         np.zeros(total(depths), np.float32),
         np.zeros(total(depths), np.float32),
@@ -102,7 +103,7 @@ def new_screen_buffers(w: int, h: int, blurred: bool) -> ScreenBuffers:
 def new_blur_scratch(levels: Levels) -> BlurScratch:
     """Room for every level of a table of colour levels."""
     texels = int(levels[1, 1] * levels[1, 2]) if len(levels) > 1 else 0
-    return BlurScratch(np.zeros((texels, 3), np.float32), np.zeros((texels, 3), np.float32))
+    return BlurScratch(np.zeros((texels, 4), np.float32), np.zeros((texels, 4), np.float32))
 
 
 @inlined
@@ -112,7 +113,7 @@ def _average_row(source: F32, w: int, y: int, target: F32, tw: int) -> None:
     ya, yb = min(2 * y, h - 1), min(2 * y + 1, h - 1)
     for x in range(tw):
         xa, xb = min(2 * x, w - 1), min(2 * x + 1, w - 1)
-        for c in range(3):
+        for c in range(4):
             total = source[ya * w + xa, c] + source[ya * w + xb, c] + source[yb * w + xa, c] + source[yb * w + xb, c]
             target[y * tw + x, c] = 0.25 * total
 
@@ -130,14 +131,14 @@ def blur_level(color: F32_2D, levels: I64_2D, level: int, scratch: BlurScratch) 
     # The filter is a product of one along the rows and one down the columns: 18 taps in place of 81.
     for y in range(th):
         for x in range(tw):
-            for c in range(3):
+            for c in range(4):
                 s = 0.0
                 for k in range(9):
                     s += _TAPS[k] * half[y * tw + min(tw - 1, max(0, x + k - 4)), c]
                 across[y * tw + x, c] = s
     for y in range(th):
         for x in range(tw):
-            for c in range(3):
+            for c in range(4):
                 s = 0.0
                 for k in range(9):
                     s += _TAPS[k] * across[min(th - 1, max(0, y + k - 4)) * tw + x, c]
@@ -177,7 +178,7 @@ def _farthest_around(depth: F32, w: int, h: int, x: int, y: int) -> np.float32:
 
 
 @inlined
-def _bilinear(color: F32, first: int, w: int, h: int, x: float, y: float) -> Vec:
+def _bilinear(color: F32, first: int, w: int, h: int, x: float, y: float) -> Rgba:
     """Bilinear value at pixel coordinates (texel centres at +0.5), clamped to the edge."""
     x = min(max(x - 0.5, 0.0), w - 1.0)
     y = min(max(y - 0.5, 0.0), h - 1.0)
@@ -190,22 +191,23 @@ def _bilinear(color: F32, first: int, w: int, h: int, x: float, y: float) -> Vec
         wa * color[a, 0] + wb * color[b, 0] + wc * color[c, 0] + wd * color[d, 0],
         wa * color[a, 1] + wb * color[b, 1] + wc * color[c, 1] + wd * color[d, 1],
         wa * color[a, 2] + wb * color[b, 2] + wc * color[c, 2] + wd * color[d, 2],
+        wa * color[a, 3] + wb * color[b, 3] + wc * color[c, 3] + wd * color[d, 3],
     )
 
 
 @inlined
-def color_at(screen: Screen, px: float, py: float, lod: float) -> Vec:
-    """Trilinear colour at a pixel coordinate of level 0."""
+def color_at(screen: Screen, px: float, py: float, lod: float) -> Rgba:
+    """Trilinear colour and coverage at a pixel coordinate of level 0."""
     # Sizes are floored, so a level is not a power of two smaller: places are found by their share of the picture.
     last = screen.color_level.shape[0] - 1
     lod = min(max(lod, 0.0), float(last))
     low = int(lod)
     first, w, h = screen.color_level[low, 0], screen.color_level[low, 1], screen.color_level[low, 2]
     u, v = px / screen.camera.size[0], py / screen.camera.size[1]
-    r, g, b = _bilinear(screen.color, first, w, h, u * w, v * h)
+    r, g, b, a = _bilinear(screen.color, first, w, h, u * w, v * h)
     f = lod - low
     if f > 0.0 and low < last:
         first, w, h = screen.color_level[low + 1, 0], screen.color_level[low + 1, 1], screen.color_level[low + 1, 2]
-        r1, g1, b1 = _bilinear(screen.color, first, w, h, u * w, v * h)
-        return (r + (r1 - r) * f, g + (g1 - g) * f, b + (b1 - b) * f)
-    return (r, g, b)
+        r1, g1, b1, a1 = _bilinear(screen.color, first, w, h, u * w, v * h)
+        return (r + (r1 - r) * f, g + (g1 - g) * f, b + (b1 - b) * f, a + (a1 - a) * f)
+    return (r, g, b, a)

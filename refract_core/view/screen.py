@@ -13,6 +13,7 @@ from ..kernels.compile import inlined
 from ..kernels.vec import Vec, along, dot, row, sub
 from ..optics.lobes import Cone
 from ..probes.volumes import edge_fade
+from ..world.textures import Rgba
 from .camera import PixelPoint, pixel_point, pixel_width, project
 from .pyramid import Screen, color_at
 
@@ -39,11 +40,14 @@ class ScreenHit(NamedTuple):
     """along the ray [m]"""
 
 
+_NOTHING = (0.0, 0.0, 0.0, 0.0)
+
+
 class ScreenLight(NamedTuple):
     """What the screen shows to one ray."""
 
-    color: Vec
-    """radiance"""
+    color: Rgba
+    """radiance, premultiplied by coverage, and coverage: what is not covered there nobody has answered"""
     weight: float
     """0 .. 1"""
     confidence: float
@@ -158,13 +162,13 @@ def _other(a: float, w: float, cell: int, level: int) -> int:
 
 
 @inlined
-def _on_surface(screen: Screen, origin: Vec, direction: Vec, hit: ScreenHit) -> Vec:
-    """Bilinear colour of the four nearest pixels, leaving out those that show another surface."""
+def _on_surface(screen: Screen, origin: Vec, direction: Vec, hit: ScreenHit) -> Rgba:
+    """Bilinear colour and coverage of the four nearest pixels, leaving out those that show another surface."""
     width, height = int(screen.camera.size[0]), int(screen.camera.size[1])
     x, y = hit.x - 0.5, hit.y - 0.5
     x0, y0 = math.floor(x), math.floor(y)
     _, _, z = project(screen.camera, along(origin, direction, hit.distance))
-    r = g = b = total = 0.0
+    r = g = b = a = total = 0.0
     for k in range(4):
         ix, iy = x0 + k % 2, y0 + k // 2
         w = (x - x0 if k % 2 else 1.0 - x + x0) * (y - y0 if k // 2 else 1.0 - y + y0)
@@ -180,9 +184,10 @@ def _on_surface(screen: Screen, origin: Vec, direction: Vec, hit: ScreenHit) -> 
         r += w * screen.color[i, 0]
         g += w * screen.color[i, 1]
         b += w * screen.color[i, 2]
+        a += w * screen.color[i, 3]
         total += w
     if total > 1e-3:
-        return (r / total, g / total, b / total)
+        return (r / total, g / total, b / total, a / total)
     return color_at(screen, hit.x, hit.y, 0.0)
 
 
@@ -191,10 +196,10 @@ def screen_march(screen: Screen, ray: Cone) -> ScreenLight:
     """What the march finds; the level of the pyramid is such that half of its blur falls within the cone at the hit."""
     hit = march(screen, ray.origin, ray.direction)
     if not hit.found:
-        return ScreenLight((0.0, 0.0, 0.0), 0.0, 0.0)
+        return ScreenLight(_NOTHING, 0.0, 0.0)
     w = edge_fade(hit.x / screen.camera.size[0], hit.y / screen.camera.size[1], SCREEN_FADE)
     if w <= 0.0:
-        return ScreenLight((0.0, 0.0, 0.0), 0.0, 0.0)
+        return ScreenLight(_NOTHING, 0.0, 0.0)
     lod = 0.0
     if ray.blur > 0.0:
         _, _, z = project(screen.camera, along(ray.origin, ray.direction, hit.distance))
@@ -217,10 +222,10 @@ def screen_proxy(screen: Screen, ray: Cone, distance: float, shaded: PixelPoint,
     width, height = int(screen.camera.size[0]), int(screen.camera.size[1])
     px, py, z = project(screen.camera, along(ray.origin, ray.direction, distance))
     if z <= 0.0:
-        return ScreenLight((0.0, 0.0, 0.0), 0.0, 0.0)
+        return ScreenLight(_NOTHING, 0.0, 0.0)
     w = edge_fade(px / width, py / height, SCREEN_FADE)
     if w <= 0.0:
-        return ScreenLight((0.0, 0.0, 0.0), 0.0, 0.0)
+        return ScreenLight(_NOTHING, 0.0, 0.0)
     # What is in front of the shaded surface cannot be behind it in the glass: then the lookup stays at its own pixel.
     # The rougher the lobe, the less it moves, since a coarse texel already holds both places.
     there = screen.depth[min(int(py), height - 1) * width + min(int(px), width - 1)]

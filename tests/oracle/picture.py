@@ -76,7 +76,7 @@ class Oracle:
         """What is mirrored is marched for, which is not known here: planes that hold reflections are left out."""
         if self.marches and (settings.screen != "proxy" or settings.max_layers > 1 or len(scene.probes) != 1):
             raise NotImplementedError("the screen is known by proxy, with one layer and one probe that lends its proxy")
-        self._seen: dict[tuple[int, int, int], tuple[Vec, float]] = {}
+        self._seen: dict[tuple[int, int, int], tuple[Vec, float, float]] = {}
 
     def pixel(self, x: int, y: int, nudge: tuple[float, float] = (0.0, 0.0)) -> Pixel:
         """`nudge`: look beside the sample, by so many pixels, with the very same random numbers."""
@@ -113,7 +113,7 @@ class Oracle:
         alpha, color, z, n = self._backdrop(ray, view, opaque)
         layers = [self._layer(ray, view, hit) for hit in entries]
         for layer in reversed(layers):
-            color, alpha = layer.color, max(alpha, layer.alpha)
+            color, alpha = layer.color, layer.alpha
         sums.add("beauty", [*color, alpha])
         if layers:
             self._note_glass(sums, layers[0], k)
@@ -205,7 +205,7 @@ class Oracle:
     def _on_screen(self, leaf: Leaf, view: View, z: float) -> Callable[[], Found]:
         """By the proxy of the scene's probe."""
 
-        def look(column: int, row: int) -> tuple[Vec, float]:
+        def look(column: int, row: int) -> tuple[Vec, float, float]:
             return self._opaque_at(column, row, view.sample)
 
         own = (view.key[0] + 0.5, view.key[1] + 0.5, z)
@@ -214,12 +214,12 @@ class Oracle:
             lambda p: self._project(p, view.sample),
         )  # fmt: skip
 
-    def _opaque_at(self, x: int, y: int, k: int) -> tuple[Vec, float]:
-        """Colour and depth of the picture without its glass."""
+    def _opaque_at(self, x: int, y: int, k: int) -> tuple[Vec, float, float]:
+        """Colour, depth and coverage of the picture without its glass."""
         if (x, y, k) not in self._seen:
             ray, view = self._through(x, y, k)
-            _, color, z, _ = self._backdrop(ray, view, self._first_opaque(ray, view))
-            self._seen[x, y, k] = color, z
+            alpha, color, z, _ = self._backdrop(ray, view, self._first_opaque(ray, view))
+            self._seen[x, y, k] = color, z, alpha
         return self._seen[x, y, k]
 
     def _project(self, p: Vec, k: int) -> tuple[float, float, float]:

@@ -18,8 +18,8 @@ _FADE = 0.1
 """Screen Weight Distance."""
 _INFINITE = 65504.0
 
-Look = Callable[[int, int], tuple[Vec, float]]
-"""Colour and depth of a pixel of the opaque picture."""
+Look = Callable[[int, int], tuple[Vec, float, float]]
+"""Colour, depth and coverage of a pixel of the opaque picture."""
 Project = Callable[[Vec], tuple[float, float, float]]
 """Pixel coordinates and depth of a point."""
 
@@ -28,6 +28,8 @@ class Found(NamedTuple):
     color: Vec
     weight: float
     confidence: float
+    coverage: float = 1.0
+    """of the weight, the share that is answered; the colour has it in it"""
 
 
 NOTHING = Found(ZERO, 0.0, 0.0)
@@ -43,11 +45,13 @@ def by_proxy(
     weight = edge_fade(px / width) * edge_fade(py / height)
     if z <= 0.0 or weight <= 0.0:
         return NOTHING
-    _, there = look(min(int(px), width - 1), min(int(py), height - 1))
+    _, there, _ = look(min(int(px), width - 1), min(int(py), height - 1))
     if there <= own[2]:  # in front of the glass: the pixel itself is shown instead
-        return Found(_bilinear(look, size, own[0], own[1]), weight, 0.0)
+        color, covered = _bilinear(look, size, own[0], own[1])
+        return Found(color, weight, 0.0, covered)
     right = min(z, there) / max(z, there) if there < math.inf else 0.0
-    return Found(_bilinear(look, size, px, py), weight, right)
+    color, covered = _bilinear(look, size, px, py)
+    return Found(color, weight, right, covered)
 
 
 def proxy_distance(origin: Vec, d: Vec, proxy: Volume | None) -> float:
@@ -75,11 +79,12 @@ def edge_fade(u: float) -> float:
     return x * x * (3.0 - 2.0 * x)
 
 
-def _bilinear(look: Look, size: tuple[int, int], px: float, py: float) -> Vec:
+def _bilinear(look: Look, size: tuple[int, int], px: float, py: float) -> tuple[Vec, float]:
     x, y = clamp(px - 0.5, 0.0, size[0] - 1.0), clamp(py - 0.5, 0.0, size[1] - 1.0)
     i, j = int(x), int(y)
-    total = ZERO
+    total, covered = ZERO, 0.0
     for column, u in ((i, 1.0 - x + i), (min(i + 1, size[0] - 1), x - i)):
         for row, v in ((j, 1.0 - y + j), (min(j + 1, size[1] - 1), y - j)):
-            total = add(total, scaled(look(column, row)[0], u * v))
-    return total
+            color, _, coverage = look(column, row)
+            total, covered = add(total, scaled(color, u * v)), covered + coverage * u * v
+    return total, covered

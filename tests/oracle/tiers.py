@@ -46,9 +46,10 @@ def ask(shader: Shader, leaf: Leaf, order: tuple[str, ...], view: View, on_scree
         found = _answer(shader, leaf, tier, view, on_screen)
         weight = min(found.weight, left)
         color = add(color, scaled(found.color, weight))
-        confidence += weight * found.confidence
-        shares[tier] += weight
-        left -= weight
+        answered = weight * found.coverage
+        confidence += answered * found.confidence
+        shares[tier] += answered
+        left -= answered
     return Answer(color, shares["screen"], shares["ray"], shares["sky"], left, confidence)
 
 
