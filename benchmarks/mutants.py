@@ -121,7 +121,7 @@ MUTANTS = (
            "return smooth01(steep * (1.0 - abs(2.0 * u - 1.0))) * ", "return ",
            (ORACLE, "tests/test_volumes.py", "tests/test_screen.py")),
     Mutant("a probe takes the weight of its uncovered share", "transport/tiers.py",
-           "    w *= coverage\n", "    w *= 1.0\n", ("tests/test_probes.py", "tests/test_probe_laws.py", LAWS)),
+           "answered = weight * coverage", "answered = weight", ("tests/test_probes.py", "tests/test_probe_laws.py", LAWS)),
     Mutant("a probe's multiplier forgotten", "probes/lookup.py",
            "table.multiplier[k])", "1.0)", ("tests/test_probes.py", "tests/test_probe_laws.py")),
     Mutant("rough rays of the ray tier go straight", "transport/tiers.py",

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 import refract_core as rc
-from benchmarks import lobe, room, roughness, tiers
+from benchmarks import lobe, mutants, room, roughness, tiers
 from refract_core.scene import Mesh, Sphere
 
 F64 = NDArray[np.float64]
@@ -286,3 +286,11 @@ def test_the_edge_of_a_smooth_slab_is_a_pixel_wide_and_in_the_middle() -> None:
     for angle, light in ((0.3, 1 - F0), (-0.3, 0.0)):
         frame = rc.render(roughness.sky_scene(0.0, angle, 37), settings)
         np.testing.assert_allclose(frame.planes["refraction"][..., 0], light, atol=1e-4)
+
+
+@pytest.mark.parametrize("mutant", mutants.MUTANTS, ids=lambda m: m.name)
+def test_every_mutant_has_its_place(mutant: mutants.Mutant) -> None:
+    """The engine moves on; a mutant that cannot be made says nothing."""
+    mutants.check(mutant)
+    assert mutant.before != mutant.after
+    assert all((mutants.ROOT / test).exists() for test in mutant.tests)
