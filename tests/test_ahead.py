@@ -205,7 +205,7 @@ from refract_core.view.planes import add_tile, new_planes
 
 def added(dtype, tile):
     planes = new_planes(4, 2)
-    ones = OpaqueLayer(*(np.ones(shape, dtype) for shape in ((2, 4, 3), (2, 4), (2, 4, 3), (2, 4))))
+    ones = OpaqueLayer(*(np.ones(shape, dtype) for shape in ((2, 4, 4), (2, 4), (2, 4, 3))))
     add_tile(Pointer(planes), Pointer(ones), np.array([4, 2]), tile)
     return planes.beauty.sum()
 
