@@ -9,7 +9,7 @@ import pytest
 from scenes import checker_room, draw, glass, light, material, quad, scene, shell
 
 import refract_core as rc
-from refract_core.scene import Environment, LightKind, Model, Sphere
+from refract_core.scene import Environment, LightKind, Model, Probe, Sphere, Volume
 
 TIERS = rc.RenderSettings().tiers
 BALL = Sphere("/ball", (0.0, 0.0, 0.0), 0.6, 0)
@@ -36,6 +36,18 @@ def test_several_walls_of_glass_alone_stay_open(roughness: float) -> None:
     assert planes["layers"][16, 16] == 4
     np.testing.assert_allclose(planes["beauty"][16, 16, 3], 1.0 - (1.0 - F0) ** 4, atol=0.01)
     assert planes["beauty"][16, 16, :3].max() == 0.0
+
+
+def test_a_probe_that_saw_nothing_answers_nothing() -> None:
+    """A stage's own probe in the open: what its picture covers is what it knows."""
+    room = Volume(np.eye(4), False, (5.0, 5.0, 5.0))
+    alone = Probe("/probe", "realtime", (0.0, 0.0, 0.0), room, room, resolution=32, clipping=(0.01, 100.0))
+    wall = quad("/wall", [(-9, -9, -4), (9, -9, -4), (9, 9, -4), (-9, 9, -4)], 1)
+    kinds = [glass(Model.BOX), material("/wall", EMISSIVE=0.5)]
+    for things, share in (([], 0.0), ([wall], 1.0)):
+        planes = draw(scene(things, kinds, [BALL], probes=(alone,)), 33, 33, tiers=("probe",))
+        np.testing.assert_allclose(planes["weight.probe"][16, 16], share, atol=1e-3)
+        np.testing.assert_allclose(planes["weight.none"][16, 16], 1.0 - share, atol=1e-3)
 
 
 def test_what_stands_in_hollow_glass_is_seen() -> None:

@@ -213,3 +213,27 @@ def test_one_channel_of_a_picture_drives_a_colour(channel: Channel) -> None:
     planes = draw(scene([wall], [driven], textures=(picture,)), 8, 8)
     expected = values[channel] * scale[channel] + bias[channel]
     np.testing.assert_allclose(planes["beauty"][4, 4, :3], expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("opacity", "there"), [(0.49, False), (0.5, True), (0.51, True)])
+def test_a_cut_out_is_there_from_its_threshold_on(opacity: float, there: bool) -> None:
+    """UsdPreviewSurface: opaque where opacity is at least the threshold, absent elsewhere."""
+    wall = quad("/wall", [(-2, -2, 0), (2, -2, 0), (2, 2, 0), (-2, 2, 0)], 0)
+    leaf = material("/leaf", EMISSIVE=0.7, OPACITY=opacity, opacity_threshold=0.5)
+    planes = draw(scene([wall], [leaf]), 8, 8)
+    assert planes["beauty"][4, 4, 3] == float(there)
+
+
+def test_what_stands_behind_a_light_casts_no_shadow() -> None:
+    """A ceiling above the lamp takes nothing from the floor below it."""
+    floor = quad("/floor", [(-2, -1, 2), (2, -1, 2), (2, -1, -2), (-2, -1, -2)], 0)
+    ceiling = quad("/ceiling", [(-4, 2, 4), (-4, 2, -4), (4, 2, -4), (4, 2, 4)], 0)
+    lamp = light(LightKind.SPHERE, (0, 1, 0), (0, -1, 0), (0.2, 0.0), 5.0)
+    grey = material("/grey", DIFFUSE=0.5)
+    eye = camera((0, 0.5, 3.0), (0, -1, 0), 0.3)
+    alone, under = (
+        draw(scene(things, [grey], lights=(lamp,), cameras=(eye,)), 16, 16)["beauty"]
+        for things in ([floor], [floor, ceiling])
+    )
+    assert alone[8, 8, 0] > 0.01
+    np.testing.assert_array_equal(alone[6:10, 6:10], under[6:10, 6:10])

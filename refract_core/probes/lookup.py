@@ -250,10 +250,10 @@ def probe_light(
     confidence = 0.0
     if distance > 0.0 and far > 0.0:
         confidence = min(distance, far) / max(distance, far)
-    if coverage < 1.0 and not sky_follows:
-        if environment.present:
-            light = prefiltered(environment, sky, gloss)
-            left = 1.0 - coverage
-            r, g, b = r + light[0] * left, g + light[1] * left, b + light[2] * left
+    # Where the picture is open the sky shows; without a sky nobody knows what is there, and the share is left open.
+    if coverage < 1.0 and environment.present and not sky_follows:
+        light = prefiltered(environment, sky, gloss)
+        left = 1.0 - coverage
+        r, g, b = r + light[0] * left, g + light[1] * left, b + light[2] * left
         coverage = 1.0
     return ProbeLight(scale((r, g, b), table.multiplier[k]), coverage, fits, confidence)
