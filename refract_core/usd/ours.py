@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from functools import cache
 from typing import Any, NamedTuple
 
-from pxr import Sdf, Usd
+from pxr import Sdf, Usd, UsdGeom
 
 from ..schemas import APPLIED as _APPLIED
 from ..schemas import TYPED as _TYPED
@@ -23,6 +23,7 @@ TYPED: tuple[str, ...] = _TYPED
 PROBE = "RefractProbeAPI"
 """The schema that is built into the typed ones."""
 _TYPES = "fallbackPrimTypes"
+_TRIES = 16
 _HOLDER = Sdf.Path("/refract_collection")
 
 
@@ -47,8 +48,22 @@ def recognised(stage: Usd.Stage) -> Usd.Stage:
         session = stage.GetSessionLayer().pseudoRoot
         said = dict(session.GetInfo(_TYPES)) if session.HasInfo(_TYPES) else {}
         session.SetInfo(_TYPES, said | fallback_types())
-        stage.SetLoadRules(stage.GetLoadRules())  # composes prototypes again, which take no fallback else (usd-core 26)
+        # Prototypes take no fallback until they are composed again, and now and then not at the first try: they are
+        # composed on threads, and which of them is asked for its type first is chance (usd-core 26.11).
+        for _ in range(_TRIES):
+            stage.SetLoadRules(stage.GetLoadRules())
+            if not _has_lost_probes(stage):
+                break
     return stage
+
+
+def _has_lost_probes(stage: Usd.Stage) -> bool:
+    """Some typed probe of a prototype is still nothing to USD."""
+    return any(
+        prim.GetTypeName() in TYPED and not prim.IsA(UsdGeom.Xformable)
+        for prototype in stage.GetPrototypes()
+        for prim in Usd.PrimRange(prototype)
+    )
 
 
 def fallback_types() -> dict[str, Any]:
