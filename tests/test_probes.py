@@ -27,6 +27,7 @@ from scenes import (
 )
 
 from refract_core.kernels.compile import kernel
+from refract_core.kernels.lanes import by_address
 from refract_core.probes.lookup import ProbeTable, cube_at
 from refract_core.probes.plan import in_order
 from refract_core.rendering.session import Session, prepare
@@ -68,7 +69,7 @@ def _look(table: ProbeTable, k: int, directions: F64, lod: float, out: F64) -> N
 def look(session: Session, directions: F64, lod: float = 0.0, k: int = 0) -> F64:
     """Rows of (r, g, b, coverage, distance)."""
     out = np.empty((len(directions), 5))
-    _look(session.probes, k, np.ascontiguousarray(directions), lod, out)
+    _look(by_address(session.probes), k, np.ascontiguousarray(directions), lod, out)
     return out
 
 
@@ -116,12 +117,12 @@ def test_levels_of_a_constant_room_are_that_constant(lod: float) -> None:
     rough = glass(Model.TRACED, ROUGHNESS=0.5)
     what = scene(walls, [*materials, rough], [Sphere("/ball", CENTRE, 0.5, 1)], probes=(probe(),))
     session = prepared(what)
-    assert session.table.last[0] == 6
+    assert session.probes.last[0] == 6
     np.testing.assert_allclose(look(session, directions(300), lod)[:, :4], [[0.6, 0.6, 0.6, 1.0]] * 300, rtol=1e-5)
 
 
 def test_smooth_glass_costs_no_levels() -> None:
-    assert prepared(with_probe(probe())).table.last[0] == 0
+    assert prepared(with_probe(probe())).probes.last[0] == 0
 
 
 def test_a_background_stands_in_for_the_sky() -> None:

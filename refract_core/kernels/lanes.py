@@ -36,23 +36,10 @@ class Column(NamedTuple):
         return 1 + len(self.per_lane)
 
 
-class Rows(NamedTuple):
-    """A field of several columns, each with a value per lane: shape (number, 8) float64."""
-
-    number: int
-
-    @property
-    def axes(self) -> int:
-        """Number of axes of its array."""
-        return 2
-
-
 Flags = Annotated[NDArray[np.int32], Column(np.int32)]
 """shape (8,) int32: 0 or 1, or a small code"""
 Words = Annotated[NDArray[np.int32], Column(np.int32)]
 """shape (8,) int32: numbers of parts, things, ..."""
-Pairs = Annotated[NDArray[np.int64], Column(np.int64, (2,))]
-"""shape (8, 2) int64"""
 Scalars = Annotated[NDArray[np.float64], Column(np.float64)]
 """shape (8,) float64"""
 Vectors = Annotated[NDArray[np.float64], Column(np.float64, (3,))]
@@ -80,8 +67,6 @@ def new_lanes(record: type[R]) -> R:
         columns = [extra for extra in getattr(hint, "__metadata__", ()) if isinstance(extra, Column)]
         if columns:
             fields.append(np.zeros((LANES, *columns[0].per_lane), columns[0].dtype))
-        elif rows := [extra for extra in getattr(hint, "__metadata__", ()) if isinstance(extra, Rows)]:
-            fields.append(np.zeros((rows[0].number, LANES)))
         else:
             fields.append(new_lanes(hint))
     return record(*fields)

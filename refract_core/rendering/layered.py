@@ -119,7 +119,7 @@ class Layered:
 
             yield Pass(_without_rays, [levels, blur])
         asking = by_address(
-            Asking(self.order, self.by_proxy, Screen(view, *screen), session.table, session.thing_probe)
+            Asking(self.order, self.by_proxy, Screen(view, *screen), session.probes, session.thing_probe)
         )
         layer, result, planes = by_address(self.layers[k]), by_address(self.result), by_address(self.planes)
 

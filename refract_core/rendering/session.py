@@ -34,9 +34,6 @@ class Session(NamedTuple):
     """by address"""
     bvh: Bvh
     probes: ProbeTable
-    """by address"""
-    table: ProbeTable
-    """the same, for Python to read"""
     thing_probe: NDArray[np.int32]
     rays: int
     notices: tuple[Notice, ...]
@@ -86,7 +83,7 @@ def _prepare(
 
     work.progress(span[0], "probes")
     rays = fill_table(table, entries, world, run, samples)
-    return Session(world, bvh, by_address(table), table, chosen.thing_probe, rays, chosen.notices)
+    return Session(world, bvh, table, chosen.thing_probe, rays, chosen.notices)
 
 
 def capture_probes(
@@ -116,7 +113,7 @@ def capture_probes(
     with working(executor, jobs, progress, cancel) as work:
         chosen = plan_capture(scene, [replace(probe, cubemap=None) for probe in probes])
         session = _prepare(scene, choose_camera(scene, ""), chosen, True, samples, work, (0.0, 1.0))
-    return [cubemap_of(session.table, k) for k in range(len(probes))]
+    return [cubemap_of(session.probes, k) for k in range(len(probes))]
 
 
 def is_rough(scene: Scene) -> bool:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..kernels.arrays import F32_1D, F32_2D, F32_3D, I64_2D
 from ..kernels.compile import inlined, kernel
-from ..world.textures import Rgba
+from ..world.textures import Rgba, mix
 from .camera import View
 
 F32 = NDArray[np.float32]
@@ -204,10 +204,9 @@ def color_at(screen: Screen, px: float, py: float, lod: float) -> Rgba:
     low = int(lod)
     first, w, h = screen.color_level[low, 0], screen.color_level[low, 1], screen.color_level[low, 2]
     u, v = px / screen.camera.size[0], py / screen.camera.size[1]
-    r, g, b, a = _bilinear(screen.color, first, w, h, u * w, v * h)
+    finer = _bilinear(screen.color, first, w, h, u * w, v * h)
     f = lod - low
     if f > 0.0 and low < last:
         first, w, h = screen.color_level[low + 1, 0], screen.color_level[low + 1, 1], screen.color_level[low + 1, 2]
-        r1, g1, b1, a1 = _bilinear(screen.color, first, w, h, u * w, v * h)
-        return (r + (r1 - r) * f, g + (g1 - g) * f, b + (b1 - b) * f, a + (a1 - a) * f)
-    return (r, g, b, a)
+        return mix(finer, _bilinear(screen.color, first, w, h, u * w, v * h), f)
+    return finer

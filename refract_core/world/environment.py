@@ -85,7 +85,7 @@ def pack(environment: Environment | None) -> EnvironmentTable:
     row_cdf, column_cdf = _distribution(_level_over(pool, levels, SAMPLING_SHAPE))
     return EnvironmentTable(
         present=environment is not None,
-        dark=not pool.any(),
+        dark=not pool[-1].any(),  # the last level is the mean of what is never negative
         pool=pool,
         levels=levels,
         poles=poles,

@@ -218,7 +218,8 @@ def _reduced(x: float, wrap: int) -> float:
 
 
 @leaf
-def _mix(a: Rgba, b: Rgba, t: float) -> Rgba:
+def mix(a: Rgba, b: Rgba, t: float) -> Rgba:
+    """Between two colours of neighbouring levels: `a` at 0, `b` at 1."""
     return (
         a[0] + (b[0] - a[0]) * t,
         a[1] + (b[1] - a[1]) * t,
@@ -306,4 +307,4 @@ def sample(table: TextureTable, index: int, s: float, t: float, footprint: float
     if lod == level:
         return finer
     coarser = _bilinear(table, index, level + 1, x, y, wrap_s, wrap_t)
-    return _mix(finer, coarser, lod - level)
+    return mix(finer, coarser, lod - level)
