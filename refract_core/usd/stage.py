@@ -117,7 +117,7 @@ def scene_from_stage(
     time = Usd.TimeCode(time_range(stage)[0] if time_code is None else time_code)
     notices = _composition_notices(stage)
     with captured():  # composing again repeats the same warnings
-        stage = posed(stage, time, notices)
+        stage = recognised(posed(stage, time, notices))
     with captured() as heard:
         try:
             scene = _read(stage, time, purposes, camera, notices, keep)

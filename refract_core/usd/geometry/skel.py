@@ -35,9 +35,10 @@ def _copy(stage: Usd.Stage) -> Usd.Stage:
     """The same layers under a session layer of our own; what is skinned is no instance there, to have its own pose."""
     session = Sdf.Layer.CreateAnonymous("posed.usda")
     session.subLayerPaths.append(stage.GetSessionLayer().identifier)
-    copy = recognised(Usd.Stage.OpenMasked(stage.GetRootLayer(), session, stage.GetPopulationMask()))
+    copy = Usd.Stage.OpenMasked(stage.GetRootLayer(), session, stage.GetPopulationMask())
     copy.MuteAndUnmuteLayers(stage.GetMutedLayers(), [])
     copy.SetLoadRules(stage.GetLoadRules())
+    recognised(copy)  # last, for each of these composes again
     copy.SetEditTarget(session)
     for _ in range(_NESTED_INSTANCES):
         prims = _of_type(copy, UsdSkel.Root) + _of_type(copy, UsdSkel.Animation)
