@@ -179,6 +179,16 @@ def Xform "Copy" (
     instanceable = true
     references = </Model>
 ) {}
+def Xform "Nested" {
+    def Xform "Within" (
+        instanceable = true
+        references = </Model>
+    ) {}
+}
+def Xform "Deep" (
+    instanceable = true
+    references = </Nested>
+) {}
 """
 
 
@@ -225,7 +235,9 @@ def test_a_stage_reads_the_same_after_other_stages_were_made(tmp_path: Path) -> 
             expected = str(error)
         assert plain(late[path]) == plain(expected), path
     scene = rc.load_stage(room)
-    assert [probe.path for probe in scene.probes] == ["/Plain", "/Window", "/Applied", "/Model/Inner", "/Copy/Inner"]
+    assert [probe.path for probe in scene.probes] == [
+        "/Plain", "/Window", "/Applied", "/Model/Inner", "/Copy/Inner", "/Nested/Within/Inner", "/Deep/Within/Inner",
+    ]  # fmt: skip
 
 
 def test_repairs_are_the_same_after_other_stages_were_made(tmp_path: Path) -> None:

@@ -23,7 +23,6 @@ TYPED: tuple[str, ...] = _TYPED
 PROBE = "RefractProbeAPI"
 """The schema that is built into the typed ones."""
 _TYPES = "fallbackPrimTypes"
-_TRIES = 16
 _HOLDER = Sdf.Path("/refract_collection")
 
 
@@ -45,25 +44,30 @@ def known() -> bool:
 def recognised(stage: Usd.Stage) -> Usd.Stage:
     """The same stage, where typed probes have a place as Xforms do: if USD does not know, its session layer says so."""
     if not known():
-        session = stage.GetSessionLayer().pseudoRoot
-        said = dict(session.GetInfo(_TYPES)) if session.HasInfo(_TYPES) else {}
-        session.SetInfo(_TYPES, said | fallback_types())
-        # Prototypes take no fallback until they are composed again, and now and then not at the first try: they are
-        # composed on threads, and which of them is asked for its type first is chance (usd-core 26.11).
-        for _ in range(_TRIES):
-            stage.SetLoadRules(stage.GetLoadRules())
-            if not _has_lost_probes(stage):
-                break
+        session = stage.GetSessionLayer()
+        said = dict(session.pseudoRoot.GetInfo(_TYPES)) if session.pseudoRoot.HasInfo(_TYPES) else {}
+        session.pseudoRoot.SetInfo(_TYPES, said | fallback_types())
+        # Prototypes take no fallback, or by chance (usd-core 26.11). Their instances are made prims of their own, the
+        # outer ones first: an instance inside a prototype cannot be spoken of.
+        while lost := _instances_of_lost_probes(stage):
+            with Sdf.ChangeBlock():
+                for path in lost:
+                    Sdf.CreatePrimInLayer(session, path).SetInfo("instanceable", False)
     return stage
 
 
-def _has_lost_probes(stage: Usd.Stage) -> bool:
-    """Some typed probe of a prototype is still nothing to USD."""
-    return any(
-        prim.GetTypeName() in TYPED and not prim.IsA(UsdGeom.Xformable)
-        for prototype in stage.GetPrototypes()
-        for prim in Usd.PrimRange(prototype)
-    )
+def _instances_of_lost_probes(stage: Usd.Stage) -> list[Sdf.Path]:
+    """Where the prototypes stand that have typed probes in them, at any depth, which USD does not take for Xforms."""
+
+    def loses(prototype: Usd.Prim) -> bool:
+        return any(
+            (prim.GetTypeName() in TYPED and not prim.IsA(UsdGeom.Xformable))
+            or (prim.IsInstance() and loses(prim.GetPrototype()))
+            for prim in Usd.PrimRange(prototype)
+        )
+
+    instances = (prim for prototype in stage.GetPrototypes() if loses(prototype) for prim in prototype.GetInstances())
+    return [prim.GetPath() for prim in instances if not prim.IsInPrototype()]
 
 
 def fallback_types() -> dict[str, Any]:
