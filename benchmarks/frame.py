@@ -42,7 +42,7 @@ def bare_tile(handle, view, work, tile):  # type: ignore[no-untyped-def]
         for x0 in range(tile[0], tile[2], 4):
             clear(packet)
             for lane in range(LANES):
-                add_view_ray(packet, view, lane, x0 + lane % 4, y0 + lane // 4, 0.0, 1e30, EVERYTHING)
+                add_view_ray(packet, view, lane, x0 + lane % 4, y0 + lane // 4, EVERYTHING)
             intersect(packet, handle, True)
             total += packet.rays[T_FAR, 0]
     return packet.tally[0], total

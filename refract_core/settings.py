@@ -9,7 +9,7 @@ from .errors import UsageError
 from .models import MODELS as MODELS
 
 TIERS = ("screen", "ray", "probe", "sky")
-SCREEN_METHODS = ("march", "proxy")
+SCREEN_METHODS = ("march", "proxy", "traced")
 PURPOSES = ("default", "render", "proxy", "guide")
 MAX_PIXELS = 1 << 28
 
@@ -28,12 +28,15 @@ class RenderSettings:
     """Samples per pixel, 1 .. 4096."""
     tiers: tuple[str, ...] = ("screen", "probe", "ray", "sky")
     """Order in which refraction and reflection look for their colour."""
-    screen: str = "march"
-    """`march` the opaque depth, or `proxy` exactly as HDRP."""
+    screen: str = "traced"
+    """`traced`: the opaque picture answers where it shows the very surface that the ray meets. `march` its depth, or
+    `proxy` exactly as HDRP."""
     model: str = ""
     """Overrides every refractive material's model where not ''."""
-    max_layers: int = 4
-    """Refractive surfaces along one view ray, 1 .. 32; 1 is HDRP."""
+    max_layers: int = 16
+    """Refractive surfaces that a ray may enter before it sees no more glass, 1 .. 32; 1 is HDRP."""
+    cut: float = 0.02
+    """Weight below which a branch of light is not followed for itself, but given to its stronger sibling, 0 .. 1."""
     exposure: float = 0.0
     """Stops added to the camera's own exposure, -64 .. 64."""
     purposes: tuple[str, ...] = ("default", "render")
@@ -53,6 +56,7 @@ class RenderSettings:
             )
         _in_range("samples", self.samples, 1, 4096)
         _in_range("max_layers", self.max_layers, 1, 32)
+        _in_range("cut", self.cut, 0.0, 1.0)
         _in_range("jobs", self.jobs, 0, 4096)
         _in_range("tile_size", self.tile_size, 1, 65536)
         _in_range("exposure", self.exposure, -64.0, 64.0)

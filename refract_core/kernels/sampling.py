@@ -44,8 +44,9 @@ class Purpose(IntEnum):
 _PURPOSES = 1 << 12
 """Dimensions of a branch; lights beyond so many share theirs with another branch."""
 
-# How a branch goes on from the one before it: the next digit, to the base 4, of its number.
-MIRRORED, LEAF = 1, 2
+# How a branch goes on from the one before it: the next digit, to the base 4, of its number. What an opaque surface
+# mirrors, what goes through an interface of glass, and what glances off it.
+MIRRORED, THROUGH, GLANCED = 1, 2, 3
 
 
 class Key(NamedTuple):
@@ -80,7 +81,7 @@ def key_of(keys: Keys, lane: int) -> Key:
 
 @inlined
 def branched(key: Key, step: int) -> Key:
-    """The key of a ray that follows from one with `key`, by a step of MIRRORED or LEAF."""
+    """The key of a ray that follows from one with `key`, by a step of the three."""
     return Key(key.x, key.y, 4 * key.branch + step)
 
 

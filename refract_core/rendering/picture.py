@@ -20,11 +20,11 @@ from ..models import BY_TOKEN, SHEET, Behind
 from ..progress import COMPILING
 from ..scene import Camera, Notice, Scene
 from ..settings import RenderSettings
-from ..transport.layers import refract_tile
+from ..transport.tree import tree_tile
 from ..version import __version__
 from ..view.camera import image_size, view_of
 from ..view.planes import by_name, finish_of, finish_tile, new_planes
-from .layered import Layered
+from .branching import Tree
 from .session import Session, choose_camera, prepare
 from .work import Cancel, Progress, Work, tiles_of, working
 
@@ -61,7 +61,7 @@ def render(
     camera = choose_camera(scene, settings.camera)
     width, height = image_size(camera, settings.image_width, settings.image_height)
     with working(executor, settings.jobs, progress, cancel) as work:
-        if not is_compiled(refract_tile):
+        if not is_compiled(tree_tile):
             work.progress(0.0, COMPILING)
         session = prepare(scene, camera, settings, work)
         planes, rays = _draw(session, scene, camera, settings, (width, height), work)
@@ -105,7 +105,7 @@ def _draw(
     """All samples, averaged into planes. Returns the planes by AOV name, and rays traced."""
     tiles = tiles_of(*size, settings.tile_size)
     planes = new_planes(*size)
-    integrator = Layered(session, scene, settings, tiles, planes)
+    integrator = Tree(session, scene, camera, settings, tiles, planes)
     rays = 0
     for sample in range(settings.samples):
         work.progress(0.2 + 0.8 * sample / settings.samples, "image")

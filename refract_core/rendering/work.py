@@ -59,10 +59,10 @@ def working(
 
 
 def tiles_of(width: int, height: int, side: int) -> list[Tile]:
-    """Squares that cover the image; their sides are multiples of 4, so that blocks never depend on them."""
-    side = (side + 3) // 4 * 4
+    """Squares that cover the image; their sides are multiples of 8, so that cells never depend on them."""
+    side = (side + 7) // 8 * 8
     return [
-        (x, y, min(x + side, (width + 3) // 4 * 4), min(y + side, (height + 3) // 4 * 4))
+        (x, y, min(x + side, (width + 7) // 8 * 8), min(y + side, (height + 7) // 8 * 8))
         for y in range(0, height, side)
         for x in range(0, width, side)
     ]

@@ -1,3 +1,3 @@
-"""Light through glass: where a ray leaves it, which tier answers there, and how a layer of it is drawn."""
+"""Light through glass: a tree of rays for every pixel that sees some, and the tiers that answer where it ends."""
 
-__all__ = ["layers", "tiers"]
+__all__ = ["crossing", "eye", "rays", "tiers", "tree"]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..kernels.arrays import I32_1D
 from ..kernels.compile import flag, inlined
 from ..kernels.lanes import LANES, Column, Flags, Scalars, Vectors, Words
-from ..kernels.sampling import LEAF, Keys, Purpose, branched, key_of, set_key, unit_pair
+from ..kernels.sampling import Keys, Purpose, key_of, set_key, unit_pair
 from ..kernels.vec import Vec, add, frame, normalize, row, scale
 from ..optics.interface import screen_lod_hdrp
 from ..optics.lobes import Cone
@@ -24,17 +24,18 @@ from ..probes.reach import next_of, piece_of
 from ..probes.volumes import update_headroom
 from ..view.camera import PixelPoint
 from ..view.pyramid import Screen
-from ..view.screen import screen_march, screen_proxy
+from ..view.screen import screen_march, screen_proxy, screen_traced
 from ..world.embree import OPAQUE, SCATTERED, Packet, clear, set_ray
 from ..world.environment import prefiltered
-from ..world.shading import Block, load_hits, shade
+from ..world.shading import Block, load_hits, load_surface, shade
+from ..world.surface import NOTHING, HitLanes, Ray, interaction, kept_hit
 from ..world.tables import World
 from ..world.tracing import intersect_world
 
 SCREEN, RAY, PROBE, SKY = 0, 1, 2, 3
 """Codes of `settings.TIERS`, in its order."""
-BY_MARCH = flag(False)
-"""For `ask`: reflections march also where refraction goes by proxy, as HDRP's own do."""
+MARCH, PROXY, TRACED = 0, 1, 2
+"""How the screen is asked, in the order of `settings.SCREEN_METHODS`."""
 NONE = 4
 """Column of the weights for what no tier answered."""
 EMBEDDED_ONLY, ALL_RAYS = flag(True), flag(False)
@@ -64,7 +65,11 @@ class Query(NamedTuple):
     """perceptual, for HDRP's own mappings"""
     thing: Words
     embedded: Flags
-    """1: the ray starts inside a medium and is known to meet an opaque object there"""
+    """1: the ray is inside a medium, and meets an opaque object there"""
+    by_proxy: Flags
+    """1: it asks the screen by HDRP's proxy, and maps roughness as HDRP does"""
+    met: HitLanes
+    """the opaque surface that it meets; `NOTHING` where it meets none"""
     color: Vectors
     weight: Shares
     """screen, ray, probe, sky, none; sums to 1"""
@@ -76,8 +81,10 @@ class Asking(NamedTuple):
 
     order: I32_1D
     """tier codes, first asked first"""
-    by_proxy: bool
-    """refraction asks the screen by HDRP's proxy instead of by march"""
+    method: int
+    """of asking the screen: MARCH, PROXY (reflections march then, as HDRP's own do) or TRACED"""
+    traces: bool
+    """the ray tier is asked too"""
     screen: Screen
     probes: ProbeTable
     thing_probe: I32_1D
@@ -94,6 +101,8 @@ class TierScratch(NamedTuple):
     """what its mirrors show"""
     far: Scalars
     """T_FAR of the rays"""
+    sent: Flags
+    """1 where a ray of its own was sent, 2 where the hit is known, 0 where nothing is asked"""
 
 
 @inlined
@@ -127,12 +136,8 @@ def _headroom(query: Query, lane: int) -> float:
 
 
 @inlined
-def ask(query: Query, asking: Asking, by_proxy: bool, work: TierScratch, world: World, sample: int) -> None:
-    """Fill colour, weight and confidence of every lane that is on.
-
-    Args:
-        by_proxy: screen tier by proxy instead of by march, with HDRP's mapping of roughness for all tiers.
-    """
+def ask(query: Query, asking: Asking, work: TierScratch, world: World, sample: int) -> None:
+    """Fill colour, weight and confidence of every lane that is on."""
     inside = False
     for lane in range(LANES):
         for c in range(3):
@@ -157,20 +162,22 @@ def ask(query: Query, asking: Asking, by_proxy: bool, work: TierScratch, world: 
             if query.on[lane] == 0 or _headroom(query, lane) <= 1.0 - _SPENT:
                 continue
             if tier == SCREEN:
-                _ask_screen(query, lane, asking, by_proxy)
+                _ask_screen(query, lane, asking, world)
             elif tier == PROBE:
-                _ask_probes(query, lane, asking, by_proxy, world, sky_follows)
+                _ask_probes(query, lane, asking, world, sky_follows)
             elif tier == SKY and world.environment.present:
-                gloss = query.roughness[lane] if by_proxy else math.sqrt(min(1.0, 0.5 * query.blur[lane]))
+                gloss = query.roughness[lane]
+                if query.by_proxy[lane] == 0:
+                    gloss = math.sqrt(min(1.0, 0.5 * query.blur[lane]))
                 light = prefiltered(world.environment, row(query.direction, lane), gloss)
                 _add(query, lane, SKY, light, _headroom(query, lane), 1.0)
 
 
 @inlined
-def _ask_screen(query: Query, lane: int, asking: Asking, by_proxy: bool) -> None:
+def _ask_screen(query: Query, lane: int, asking: Asking, world: World) -> None:
     screen = asking.screen
     ray = Cone(row(query.origin, lane), row(query.direction, lane), query.blur[lane], query.roughness[lane])
-    if by_proxy:
+    if query.by_proxy[lane] != 0:
         k = asking.thing_probe[query.thing[lane]]
         if k < 0:
             return
@@ -178,6 +185,12 @@ def _ask_screen(query: Query, lane: int, asking: Asking, by_proxy: bool) -> None
         lod = screen_lod_hdrp(query.roughness[lane], screen.color_level.shape[0])
         shaded = PixelPoint(query.key.x[lane] + 0.5, query.key.y[lane] + 0.5, query.z_self[lane])
         color, w, confidence = screen_proxy(screen, ray, distance, shaded, lod)
+    elif asking.method == TRACED:
+        hit = kept_hit(query.met, lane)
+        if hit.part == NOTHING or (asking.traces and world.materials.gleams[hit.material] != 0):
+            return
+        at = interaction(world.geometry, hit, Ray(ray.origin, ray.direction), 0.0)
+        color, w, confidence = screen_traced(screen, ray, at.point, at.ng, hit.t, asking.traces)
     else:
         color, w, confidence = screen_march(screen, ray)
     _, w = update_headroom(1.0 - _headroom(query, lane), w)
@@ -185,7 +198,7 @@ def _ask_screen(query: Query, lane: int, asking: Asking, by_proxy: bool) -> None
 
 
 @inlined
-def _ask_probes(query: Query, lane: int, asking: Asking, by_proxy: bool, world: World, sky_follows: bool) -> None:
+def _ask_probes(query: Query, lane: int, asking: Asking, world: World, sky_follows: bool) -> None:
     """Every probe that reaches the ray's origin, in order."""
     probes = asking.probes
     p = row(query.origin, lane)
@@ -193,21 +206,19 @@ def _ask_probes(query: Query, lane: int, asking: Asking, by_proxy: bool, world: 
     i, j, l = piece_of(cuts, 0, p[0]), piece_of(cuts, 1, p[1]), piece_of(cuts, 2, p[2])  # noqa: E741
     k = next_of(sets, i, j, l, 0)
     while k >= 0 and _headroom(query, lane) > 1.0 - _SPENT:
-        _ask_probe(query, lane, k, by_proxy, probes, world, sky_follows)
+        _ask_probe(query, lane, k, probes, world, sky_follows)
         k = next_of(sets, i, j, l, k + 1)
 
 
 @inlined
-def _ask_probe(
-    query: Query, lane: int, k: int, by_proxy: bool, probes: ProbeTable, world: World, sky_follows: bool
-) -> None:
+def _ask_probe(query: Query, lane: int, k: int, probes: ProbeTable, world: World, sky_follows: bool) -> None:
     origin, direction, n = row(query.origin, lane), row(query.direction, lane), row(query.normal, lane)
     w = influence(probes, k, origin, n, direction)
     if w <= 0.0:
         return
     ray = Cone(origin, direction, query.blur[lane], query.roughness[lane])
     light, coverage, fits, confidence = probe_light(
-        probes, k, ray, by_proxy, world.environment, sky_follows and world.environment.present
+        probes, k, ray, query.by_proxy[lane] != 0, world.environment, sky_follows and world.environment.present
     )
     _, w = update_headroom(1.0 - _headroom(query, lane), w * fits)
     _add_covered(query, lane, PROBE, light, coverage, w, confidence)
@@ -215,28 +226,40 @@ def _ask_probe(
 
 @inlined
 def _ask_rays(query: Query, embedded: bool, work: TierScratch, world: World, sample: int) -> None:
-    """One ray into the opaque scene for every lane with weight left; `embedded` lanes only, or all."""
+    """Light of what every lane with weight left meets; `embedded` lanes only, or all. A cone sends a ray of its own."""
     packet, second = work.packet, work.second
     clear(packet)
-    some = False
+    some = scatters = False
     for lane in range(LANES):
+        second.on[lane] = work.sent[lane] = 0
         if query.on[lane] == 0 or _headroom(query, lane) <= 1.0 - _SPENT:
             continue
         if embedded and query.embedded[lane] == 0:
             continue
-        some = True
-        d = row(query.direction, lane)
         key = key_of(query.key, lane)
+        set_key(second.key, lane, key)
         if query.blur[lane] > 0.0:
+            scatters = True
+            work.sent[lane] = 1
             u1, u2 = unit_pair(key, sample, Purpose.ROUGH_LEAF.value)
-            d = _scatter(d, query.blur[lane], u1, u2)
-        set_key(second.key, lane, branched(key, LEAF))
-        work.far[lane] = math.inf
-        set_ray(packet, lane, row(query.origin, lane), d, 0.0, math.inf, OPAQUE)
+            d = _scatter(row(query.direction, lane), query.blur[lane], u1, u2)
+            work.far[lane] = math.inf
+            set_ray(packet, lane, row(query.origin, lane), d, 0.0, math.inf, OPAQUE)
+        elif query.met.part[lane] != NOTHING:
+            some = True
+            work.sent[lane] = 2
+    if scatters:
+        intersect_world(packet, world, work.far, SCATTERED)
+        load_hits(second, packet, world, 0.0)
+        some = True
     if not some:
         return
-    intersect_world(packet, world, work.far, SCATTERED)
-    load_hits(second, packet, world, 0.0)
+    for lane in range(LANES):
+        if work.sent[lane] == 2:
+            d = row(query.direction, lane)
+            at = interaction(world.geometry, kept_hit(query.met, lane), Ray(row(query.origin, lane), d), 0.0)
+            second.on[lane] = 1
+            load_surface(second, lane, at, world, scale(d, -1.0))
     shade(second, work.third, packet, world, sample, OPAQUE)
     for lane in range(LANES):
         if second.on[lane] != 0:

@@ -11,12 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels.arrays import F32_2D, F32_3D, F64_2D, I64_1D
+from ..kernels.arrays import F32_2D, F32_3D, F64_2D
 from ..kernels.compile import kernel
 from ..kernels.vec import row, transform_direction, transform_point
 from ..scene import Scene
 from .camera import Tile, View, pixel_point
-from .gbuffer import OpaqueLayer
 
 F32 = NDArray[np.float32]
 
@@ -143,12 +142,3 @@ def finish_tile(planes: Planes, view: View, finish: Finish, tile: Tile) -> None:
             planes.sky[y, x] /= covered
             planes.none[y, x] /= covered
             planes.confidence[y, x] /= covered
-
-
-@kernel
-def add_tile(planes: Planes, opaque: OpaqueLayer, size: I64_1D, tile: Tile) -> None:
-    """Add a finished sample's picture (the opaque layer, its glass drawn in) to the beauty. `size`: width, height."""
-    for y in range(tile[1], min(tile[3], size[1])):
-        for x in range(tile[0], min(tile[2], size[0])):
-            for c in range(4):
-                planes.beauty[y, x, c] += opaque.color[y, x, c]

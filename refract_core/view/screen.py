@@ -1,13 +1,16 @@
 """The screen tier: what a ray would see, read from the opaque picture the camera already has.
 
 `march` follows the ray through the depth pyramid and accepts a pixel only where the ray meets the plane of the surface
-seen there. `proxy` is HDRP's way: one guess at a proxy volume, reprojected, with no test but "not in front".
+seen there. `traced` knows what the ray meets, and asks whether the picture shows that. `proxy` is HDRP's way: one guess
+at a proxy volume, reprojected, with no test but "not in front".
 """
 
 from __future__ import annotations
 
 import math
 from typing import NamedTuple
+
+import numpy as np
 
 from ..kernels.compile import inlined
 from ..kernels.vec import Vec, along, dot, row, sub
@@ -26,6 +29,9 @@ _LEVEL_MEDIAN = 1.92
 """Median radius of the colour pyramid's blur, in pixels of a level. Its variance is 8/3 (4^level - 1) pixels^2, from a
 binomial filter of 2 texels^2 on each level, and half of a round Gaussian lies within 1.177 deviations."""
 _SAME = 0.02  # part of the way from eye to hit by which two pixels of one surface may disagree
+_ALIKE = 0.9  # cosine between normals of what may be one surface
+_COPLANAR = 0.002  # part of the depth by which a point may lie outside of a pixel's plane
+_EVEN, _DARK = 0.2, 0.01  # part of the brightest, and radiance, by which pixels of one light may differ
 _SLACK = 1.0  # how far outside its pixel a plane may be met, in pixels' worth of the ray
 
 
@@ -203,11 +209,67 @@ def screen_march(screen: Screen, ray: Cone) -> ScreenLight:
     lod = 0.0
     if ray.blur > 0.0:
         _, _, z = project(screen.camera, along(ray.origin, ray.direction, hit.distance))
-        radius = ray.blur * hit.distance / pixel_width(screen.camera, max(z, 1e-6)) / _LEVEL_MEDIAN
-        lod = 0.5 * math.log2(1.0 + radius * radius)
+        lod = _level(screen, ray.blur, hit.distance, z)
     if lod > 0.0:
         return ScreenLight(color_at(screen, hit.x, hit.y, lod), w, 1.0)
     return ScreenLight(_on_surface(screen, ray.origin, ray.direction, hit), w, 1.0)
+
+
+@inlined
+def screen_traced(screen: Screen, ray: Cone, point: Vec, ng: Vec, distance: float, strict: bool) -> ScreenLight:
+    """What the picture shows of the very surface that the ray is known to meet; nothing where it does not show it.
+
+    A pixel shows it if it sees a surface that faces the same way, in whose plane the point lies. Half of the bilinear
+    weight around the point must be of such pixels.
+
+    Args:
+        point: where the ray meets the surface [m].
+        ng: its unit geometric normal, on either side.
+        distance: along the ray [m].
+        strict: the pixels must also agree in colour; where they do not, light changes faster than pixels can tell
+            (below a thing that hovers, at the edge of a shadow or of a texel), and a ray of its own knows better.
+    """
+    width, height = int(screen.camera.size[0]), int(screen.camera.size[1])
+    px, py, z = project(screen.camera, point)
+    x, y = px - 0.5, py - 0.5
+    if z <= 0.0 or not (x >= 0.0 and y >= 0.0 and x < width - 1 and y < height - 1):
+        return ScreenLight(_NOTHING, 0.0, 0.0)
+    facing = ng if dot(ng, ray.direction) < 0.0 else (-ng[0], -ng[1], -ng[2])
+    x0, y0 = math.floor(x), math.floor(y)
+    total = 0.0
+    r = g = b = 0.0
+    brightest, darkest = 0.0, math.inf
+    for k in range(4):
+        ix, iy = x0 + k % 2, y0 + k // 2
+        i = iy * width + ix
+        depth = screen.depth[i]
+        normal = row(screen.normal[iy], ix)
+        if depth == math.inf or dot(normal, facing) < _ALIKE:
+            continue
+        seen = pixel_point(screen.camera, ix + 0.5, iy + 0.5, np.float64(depth))
+        if abs(dot(sub(seen, point), facing)) > _COPLANAR * z:
+            continue
+        w = (x - x0 if k % 2 else 1.0 - x + x0) * (y - y0 if k // 2 else 1.0 - y + y0)
+        total += w
+        r += w * screen.color[i, 0]
+        g += w * screen.color[i, 1]
+        b += w * screen.color[i, 2]
+        level = screen.color[i, 0] + screen.color[i, 1] + screen.color[i, 2]
+        brightest, darkest = max(brightest, level), min(darkest, level)
+    if total < 0.5 or (strict and brightest - darkest > _EVEN * brightest + _DARK):
+        return ScreenLight(_NOTHING, 0.0, 0.0)
+    if ray.blur > 0.0:
+        lod = _level(screen, ray.blur, distance, z)
+        if lod > 0.0:
+            return ScreenLight(color_at(screen, px, py, lod), 1.0, 1.0)
+    return ScreenLight((r / total, g / total, b / total, 1.0), 1.0, 1.0)
+
+
+@inlined
+def _level(screen: Screen, blur: float, distance: float, z: float) -> float:
+    """Level of the pyramid half of whose blur falls within a cone where it has gone so far."""
+    radius = blur * distance / pixel_width(screen.camera, max(z, 1e-6)) / _LEVEL_MEDIAN
+    return 0.5 * math.log2(1.0 + radius * radius)
 
 
 @inlined

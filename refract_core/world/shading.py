@@ -64,6 +64,8 @@ class Block(NamedTuple):
     """perceptual, 0 .. 1"""
     occlusion: Scalars
     """share of the sky that the material lets in, 0 .. 1"""
+    matte: Flags
+    """1 where diffuse light is asked for; 0 leaves `diffuse` at nothing, and saves its shadow rays"""
     distance: Scalars
     """hit distance [m]; inf where nothing was hit"""
 
@@ -142,6 +144,7 @@ def load_surface(block: Block, lane: int, at: Interaction, world: World, wo: Vec
     block.coat[lane] = share_input(world, at, Param.CLEARCOAT.value)
     block.coat_roughness[lane] = share_input(world, at, Param.CLEARCOAT_ROUGHNESS.value)
     block.occlusion[lane] = share_input(world, at, Param.OCCLUSION.value)
+    block.matte[lane] = 1
 
 
 @inlined
@@ -172,7 +175,8 @@ def _gather_lights(block: Block, packet: Packet, world: World, sample: int, mask
             if block.on[lane] == 0:
                 continue
             p, n, wo = row(block.point, lane), row(block.ns, lane), row(block.wo, lane)
-            block.lamp_diffuse[lane] = irradiance_factor(lights, l, p, n) * lights.diffuse[l]
+            if block.matte[lane] != 0:
+                block.lamp_diffuse[lane] = irradiance_factor(lights, l, p, n) * lights.diffuse[l]
             gloss = block.roughness[lane]
             block.lamp_specular[lane] = highlight(lights, l, p, n, wo, gloss * gloss) * lights.specular[l]
             # A clear coat has a highlight of its own, where the rest of the surface may have none.
@@ -219,7 +223,7 @@ def _gather_sky(block: Block, packet: Packet, world: World, sample: int, mask: i
         return
     clear(packet)
     for lane in range(LANES):
-        if block.on[lane] == 0:
+        if block.on[lane] == 0 or block.matte[lane] == 0:
             continue
         key = key_of(block.key, lane)
         n = row(block.ns, lane)
@@ -244,7 +248,7 @@ def _gather_sky(block: Block, packet: Packet, world: World, sample: int, mask: i
         add_shadow_ray(packet, lane, row(block.point, lane), row(block.ng, lane), direction, math.inf)
     visible(packet, world, mask, seen)
     for lane in range(LANES):
-        if block.on[lane] == 0:
+        if block.on[lane] == 0 or block.matte[lane] == 0:
             continue
         seen[lane] *= block.occlusion[lane]
         if seen[lane] > 0.0:

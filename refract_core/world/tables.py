@@ -79,6 +79,10 @@ class MaterialTable(NamedTuple):
     cutout: U8_1D
     absorption_distance: F32_1D
     abbe: F32_1D
+    priority: I32_1D
+    """as `refraction:priority`"""
+    gleams: U8_1D
+    """1 where what a surface shows depends on where it is seen from by more than a varnish does"""
 
 
 class World(NamedTuple):
@@ -134,7 +138,21 @@ def pack_materials(materials: Sequence[Material], slots: dict[str, int]) -> Mate
         cutout=per_material(lambda m: m.cutout, np.uint8),
         absorption_distance=per_material(lambda m: m.absorption_distance, np.float32),
         abbe=per_material(lambda m: m.abbe, np.float32),
+        priority=per_material(lambda m: m.priority, np.int32),
+        gleams=per_material(_gleams, np.uint8),
     )
+
+
+def _gleams(material: Material) -> bool:
+    """Some of it may be metal, or have a strong colour of its own, and be smooth enough to show a highlight's shape."""
+
+    def least(param: Param) -> float:
+        source = material.inputs[param]
+        return 0.0 if source.texture >= 0 or source.primvar else source.value[0]
+
+    metal = material.inputs[Param.METALLIC]
+    strong = material.specular_workflow or metal.texture >= 0 or bool(metal.primvar) or metal.value[0] > 0.1
+    return strong and least(Param.ROUGHNESS) < 0.5
 
 
 def _driven(material: Material) -> int:
