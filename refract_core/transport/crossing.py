@@ -40,8 +40,13 @@ from .rays import (
     slot_of,
 )
 
-MOST_MET = 64
+MOST_MET = 128
 """Pieces of glass that a ray may meet before it is given up."""
+
+_LATE = 96
+"""Pieces after which a ray is let out at the next occasion."""
+_FAINT = 1.0 / 32.0
+"""Part of the cut below which what goes through is not followed."""
 
 # What a piece of glass is to a ray that has met it.
 PASSED, ENTERED, ANSWERED, LEFT = 0, 1, 2, 3
@@ -245,7 +250,7 @@ def cross(meeting: Meeting, lane: int, now: Rays, rules: Rules) -> None:
     if dot(r, ng) <= 0.0:
         r = reflect(d, ng)
     put(meeting.mirrored, lane, r)
-    _cut(meeting, lane, rules.cut)
+    _cut(meeting, lane, rules.cut, now.met[lane] >= _LATE)
 
 
 @inlined
@@ -294,18 +299,22 @@ def _weigh(meeting: Meeting, lane: int, now: Rays, c: int, share: float) -> None
 
 
 @inlined
-def _cut(meeting: Meeting, lane: int, cut: float) -> None:
-    """Drop the weaker branch if it is below the cut, and give its energy to the other one."""
+def _cut(meeting: Meeting, lane: int, cut: float, late: bool) -> None:
+    """Drop a branch that is not worth its rays, and give its energy to the other one.
+
+    What is mirrored goes first: what goes through ends sooner. Light that hardly gets out of a ball at each of many
+    reflections must be let out each time, or it would run round in there for ever with all its weight.
+    """
     r = t = 0.0
     for c in range(3):
         r = max(r, meeting.mirrored_weight[lane, c])
         t = max(t, meeting.weight[lane, c])
-    if r < cut and r <= t:
+    if t > 0.0 and (r < cut or late):
         for c in range(3):
             meeting.weight[lane, c] += meeting.mirrored_weight[lane, c]
             meeting.clear[lane, c] += meeting.mirrored_clear[lane, c]
         r = 0.0
-    elif t < cut and t < r:
+    elif t < cut * _FAINT:
         for c in range(3):
             meeting.mirrored_weight[lane, c] += meeting.weight[lane, c]
             meeting.mirrored_clear[lane, c] += meeting.clear[lane, c]

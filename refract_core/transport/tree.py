@@ -62,7 +62,7 @@ class Cell(NamedTuple):
     color: F64_2D
     """shape (N, 3)"""
     missing: F64_1D
-    """share of the light that nobody answered"""
+    """share of the light that comes from ahead and that nobody answered"""
     refraction: F64_2D
     """shape (N, 3)"""
     reflection: F64_2D
@@ -268,11 +268,15 @@ def _trace(scratch: TreeScratch, world: World, rules: Rules, taken: int) -> None
             continue
         hit = hit_in(packet, lane, world.geometry)
         keep_hit(met, lane, hit)
-        if now.media.depth[lane] == 0 or world.materials.model[hit.material] == Model.NONE.value:
+        if world.materials.model[hit.material] == Model.NONE.value:
             continue
         # Where glass touches an opaque object, as on a table, the two surfaces tie, and the ray could come out on the
-        # far side of the table: in a medium an opaque surface within rounding of the hit takes it.
+        # far side of the table: from inside, an opaque surface within rounding of the glass takes it. "Inside" is in a
+        # medium, or behind a model's exit, before the wall of the real body.
         p, d = row(now.origin, lane), row(now.direction, lane)
+        if now.media.depth[lane] == 0:
+            if now.entered[lane] == 0 or dot(interaction(world.geometry, hit, Ray(p, d), 0.0).ng, d) <= 0.0:
+                continue
         near = tie(along(p, d, hit.t))
         scratch.far[lane] = hit.t + near
         set_ray(packet, lane, p, d, max(0.0, hit.t - near), hit.t + near, OPAQUE)
@@ -395,7 +399,7 @@ def _ask_all(
         ask(query, asking, scratch.work, world, sample)
         for lane in range(min(LANES, leaves - first)):
             if query.on[lane] != 0:
-                _add_leaf(scratch.cell, scratch.leaves, query, first + lane, lane)
+                _add_leaf(scratch.cell, scratch.leaves, query, first + lane, lane, asking.screen.camera)
 
 
 @inlined
@@ -420,7 +424,7 @@ def _load_query(scratch: TreeScratch, asking: Asking, x0: int, y0: int, k: int, 
 
 
 @inlined
-def _add_leaf(cell: Cell, leaves: Rays, query: Query, k: int, lane: int) -> None:
+def _add_leaf(cell: Cell, leaves: Rays, query: Query, k: int, lane: int, view: View) -> None:
     i = leaves.pixel[k]
     unanswered = max(0.0, query.weight[lane, NONE])
     mean = share = 0.0
@@ -436,7 +440,8 @@ def _add_leaf(cell: Cell, leaves: Rays, query: Query, k: int, lane: int) -> None
             cell.refraction[i, c] += light
             cell.weight[i, c] += w
             cell.clear[i, c] += leaves.clear[k, c]
-    cell.missing[i] += mean * unanswered
+    if dot(row(leaves.direction, k), row(view.axes, 2)) > 0.0:  # it would have seen a background
+        cell.missing[i] += mean * unanswered
     if leaves.side[k] == MIRRORED_SIDE:
         return
     for tier in range(4):
