@@ -1,7 +1,8 @@
 """Scenes by number: small, and of everything that a scene may hold.
 
 A table with glass standing on it, opaque things in front of, behind and inside glass, slanted panes, meshes of two
-glasses; every input of every material constant, textured or by primvar; every kind of light, an environment or none.
+glasses, glass inside glass and glass that overlaps, of higher, lower and equal priority, a camera inside glass; every
+input of every material constant, textured or by primvar; every kind of light, an environment or none.
 """
 
 from __future__ import annotations
@@ -167,8 +168,18 @@ def _glass(dice: Dice, model: Model, may_have_holes: bool = False) -> Material:
         inputs["OPACITY"], threshold = _holes(dice), 0.45
     return glass(
         model, specular_workflow=dice.chance(0.3), absorption_distance=dice.number(0.1, 1.5),
-        abbe=dice.pick([0.0, 15.0, 40.0]), opacity_threshold=threshold, **inputs,
+        abbe=dice.pick([0.0, 15.0, 40.0]), opacity_threshold=threshold, priority=dice.pick([0, 0, 0, 1, 2, -1]),
+        **inputs,
     )  # fmt: skip
+
+
+def _even(dice: Dice, priority: int) -> Material:
+    """Glass of one index and one colour, whichever of its places is asked: for what the eye is in."""
+    made = _glass(dice, Model.TRACED)
+    inputs = list(made.inputs)
+    inputs[Param.IOR] = Source((dice.number(1.05, 1.8),) * 4)
+    inputs[Param.TRANSMITTANCE] = Source(_four(dice.number(0.5, 1.0) for _ in range(4)))
+    return replace(made, inputs=tuple(inputs), priority=priority)
 
 
 # --- Shapes ---------------------------------------------------------------------------------------------------------
@@ -209,8 +220,8 @@ def with_bent_normals(mesh: Mesh, by: float, rng: np.random.Generator) -> Mesh:
 class _Builder:
     """A scene in the making."""
 
-    def __init__(self, dice: Dice) -> None:
-        self.dice = dice
+    def __init__(self, dice: Dice, standing: bool) -> None:
+        self.dice, self.standing = dice, standing
         self.meshes: list[Mesh] = []
         self.spheres: list[Sphere] = []
         self.materials: list[Material] = []
@@ -232,6 +243,45 @@ class _Builder:
             wall = [(-1.6, y, -1.5), (1.6, y, -1.5), (1.6, 1.2, -1.8), (-1.6, 1.2, -1.8)]
             self.add(quad("/wall", wall, self.of(_opaque(self.dice))))
 
+    def ball(self, path: str, index: int, place: NDArray[np.float64], radius: float) -> None:
+        constants = {"one": self.dice.rng.uniform(0, 1, (1, 1, 1)).astype(np.float32)}
+        constants["st"] = self.dice.rng.uniform(0, 1, (1, 1, 2)).astype(np.float32)
+        x, y, z = (float(v) for v in place)
+        self.spheres.append(Sphere(f"{path}{len(self.spheres)}", (x, y, z), radius, index, constants))
+
+    def body(self, path: str, of: Material, place: NDArray[np.float64], size: float) -> None:
+        """A ball or a turned box about a place."""
+        dice = self.dice
+        if dice.chance(0.4):
+            self.ball(path, self.of(of), place, size)
+            return
+        turn = turned(dice.point(1.0), dice.number(0, 360))
+        self.add(box(path, size * dice.rng.uniform(0.7, 1.0, 3), self.of(of), turn, place))
+
+    def nested(self, z: float) -> None:
+        """Glass with something in it: glass of any model, or something opaque; it may stick out a little."""
+        dice = self.dice
+        place, size = np.array([dice.number(-0.6, 0.6), dice.number(-0.05, 0.3), z]), dice.number(0.3, 0.5)
+        self.body("/outer", _glass(dice, dice.pick([Model.TRACED, Model.TRACED, Model.SPHERE, Model.BOX])), place, size)
+        model = dice.pick([Model.TRACED, Model.TRACED, Model.SPHERE, Model.BOX, Model.THIN, Model.NONE])
+        of = _opaque(dice) if model is Model.NONE else _glass(dice, model)
+        self.body("/inner", of, place + dice.point(0.05), size * dice.number(0.25, 0.5))
+
+    def overlapping(self, z: float) -> None:
+        """Two or three bodies of traced glass that share some space."""
+        dice = self.dice
+        place, size = np.array([dice.number(-0.6, 0.6), dice.number(-0.05, 0.3), z]), dice.number(0.25, 0.4)
+        for _ in range(dice.pick([2, 2, 3])):
+            self.body("/overlap", _glass(dice, Model.TRACED), place + dice.point(0.6) * size, size)
+
+    def around(self, eye: NDArray[np.float64]) -> None:
+        """One or two boxes of traced glass that the eye is in."""
+        dice = self.dice
+        for k in range(dice.pick([1, 1, 2])):
+            half, turn = dice.rng.uniform(0.15, 0.25, 3) * (k + 1), turned(dice.point(1.0), dice.number(0, 360))
+            index = self.of(_even(dice, dice.pick([-2, 0, 3]) + k))
+            self.add(box("/around", half, index, turn, eye + dice.point(0.05)))
+
     def thing(self, of: Material, z: float) -> None:
         """A ball, a box on the table, a turned box or a tetrahedron; of glass, sometimes with a second one on it."""
         dice = self.dice
@@ -239,14 +289,10 @@ class _Builder:
         place = np.array([dice.number(-0.8, 0.8), dice.number(-0.1, 0.3), z])
         # What touches the table ties with it: there a hole, or a face that is crossed straight, would decide which of
         # two equally near surfaces a ray meets.
-        kinds = ["ball", "turned", "tetra"] + ["standing"] * (not of.cutout and of.model is not Model.THIN)
-        kind = dice.pick(kinds)
+        stands = self.standing and not of.cutout and of.model is not Model.THIN
+        kind = dice.pick(["ball", "turned", "tetra"] + ["standing"] * stands)
         if kind == "ball":
-            constants = {"one": dice.rng.uniform(0, 1, (1, 1, 1)).astype(np.float32)}
-            constants["st"] = dice.rng.uniform(0, 1, (1, 1, 2)).astype(np.float32)
-            x, y, z = (float(v) for v in place)
-            ball = Sphere(f"/ball{len(self.spheres)}", (x, y, z), dice.number(0.2, 0.4), index, constants)
-            self.spheres.append(ball)
+            self.ball("/ball", index, place, dice.number(0.2, 0.4))
             return
         if kind == "tetra":
             mesh = _tetrahedron(dice, index, place)
@@ -292,29 +338,37 @@ def _lights(dice: Dice) -> tuple[Light, ...]:
 
 def _camera(dice: Dice) -> Camera:
     eye = np.array([dice.number(-1.0, 1.0), dice.number(0.2, 1.6), dice.number(2.0, 2.8)])
+    clipping = (1e-5, 1e6)
     if dice.chance(0.3):
-        return camera(eye, (0, -0.05, 0), 0.8, 4 / 3, orthographic=True, exposure_scale=0.7)
-    return camera(eye, (dice.number(-0.1, 0.1), -0.05, 0), dice.number(0.3, 0.42), 4 / 3)
+        return camera(eye, (0, -0.05, 0), 0.8, 4 / 3, orthographic=True, exposure_scale=0.7, clipping=clipping)
+    return camera(eye, (dice.number(-0.1, 0.1), -0.05, 0), dice.number(0.3, 0.42), 4 / 3, clipping=clipping)
 
 
-def random_scene(seed: int) -> Scene:
-    """Scene number `seed`."""
+def random_scene(seed: int, standing: bool = True) -> Scene:
+    """Scene number `seed`. `standing`: glass may stand on the table, whose faces there are one with the glass's."""
     dice = Dice(seed)
-    made = _Builder(dice)
+    made = _Builder(dice, standing)
     made.stage()
     made.thing(_opaque(dice), dice.number(-0.9, -0.4))
     for z in (dice.number(-0.4, 0.1), dice.number(0.3, 0.8)):
-        made.thing(_glass(dice, dice.pick([Model.TRACED, Model.TRACED, Model.SPHERE, Model.BOX, Model.THIN])), z)
+        kind = dice.pick(["one", "one", "nested", "overlapping"])
+        if kind == "one":
+            made.thing(_glass(dice, dice.pick([Model.TRACED, Model.TRACED, Model.SPHERE, Model.BOX, Model.THIN])), z)
+        else:
+            made.nested(z) if kind == "nested" else made.overlapping(z)
     if dice.chance(0.6):
         made.pane(dice.number(-0.6, 0.9))
     if dice.chance(0.5):
         made.thing(_opaque(dice), dice.number(-0.3, 0.5))
     environment = sky(dice.pick(range(_SKIES))) if dice.chance(0.6) else None
     lights = _lights(dice) if dice.chance(0.8) else ()
+    lens = _camera(dice)
+    if dice.chance(0.2):
+        made.around(lens.world_from_camera[:3, 3])
     moved = np.eye(4)
     moved[:3, :3] = turned((1, 0, 0), 90) * 100.0
     moved[:3, 3] = (5.0, -7.0, 11.0)
     return scene(
         made.meshes, made.materials, made.spheres, textures=_pictures(dice), lights=lights, environment=environment,
-        camera_light=not lights, cameras=(_camera(dice),), stage_from_engine=moved, metres_per_unit=0.01,
+        camera_light=not lights, cameras=(lens,), stage_from_engine=moved, metres_per_unit=0.01,
     )  # fmt: skip

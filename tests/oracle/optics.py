@@ -1,4 +1,4 @@
-"""What one interface, one stretch of glass and one closed model do to light. Who follows what is `walk`'s business."""
+"""What one interface, one stretch of glass and one closed model do to light. Who follows what is `tree`'s business."""
 
 from __future__ import annotations
 
@@ -27,14 +27,17 @@ def bent(d: Vec, n: Vec, eta: float) -> Vec | None:
     return sub(tangent, scaled(n, math.sqrt(1.0 - sine2)))
 
 
-def fresnel(cosine: float, ior: float) -> float:
-    """Reflectance of unpolarised light that comes from air."""
-    if ior == 1.0:
+def fresnel(cosine: float, eta: float) -> float:
+    """Reflectance of unpolarised light that comes in under that cosine; `eta`: ior here over ior there. By the angles
+    (Fresnel's sine and tangent laws, as ratios of the sides of the two triangles). 1 at total reflection."""
+    if eta == 1.0:
         return 0.0
-    sine_t = math.sqrt(max(0.0, 1.0 - cosine * cosine)) / ior
+    sine_t = math.sqrt(max(0.0, 1.0 - cosine * cosine)) * eta
+    if sine_t >= 1.0:
+        return 1.0
     inner = math.sqrt(1.0 - sine_t * sine_t)
-    s = (cosine - ior * inner) / (cosine + ior * inner)
-    p = (ior * cosine - inner) / (ior * cosine + inner)
+    s = (eta * cosine - inner) / (eta * cosine + inner)
+    p = (cosine - eta * inner) / (cosine + eta * inner)
     return (s * s + p * p) / 2.0
 
 
@@ -60,37 +63,38 @@ def transmitted_roughness(roughness: float, ior: float) -> float:
     return min(1.0, roughness * math.sqrt(0.835 * step / (1.0 + 2.5 * step * alpha * alpha)))
 
 
-# --- Interfaces of a traced mesh --------------------------------------------------------------------------------------
+# --- Interfaces of a mesh -------------------------------------------------------------------------------------------
 
 
 class Split(NamedTuple):
-    """Both branches of an interface."""
+    """What an interface does with one channel."""
 
     transmitted: Vec | None
     """None at total reflection"""
-    reflected: Vec
     reflectance: float
 
 
-def entering(d: Vec, n: Vec, ng: Vec, ior: float) -> Split:
-    """From air into glass. `n` (shading) and `ng` stand outward. However steep `n` is, the ray goes in: it is a sum of
-    `d` and of -`n`, both of which do, with weights that no ior above 1 makes negative."""
-    through = bent(d, n, 1.0 / ior)
-    return Split(through, _kept(mirrored(d, n), d, ng, 1.0), fresnel(clamp(-dot(d, n)), ior))
+def entering(d: Vec, n: Vec, ng: Vec, eta: float) -> Split:
+    """Into a body, `n` (shading, facing the ray) and `ng` on the ray's side. Into what is thinner, a steep `n` can
+    send the ray back to where it came from: then the true normal decides, about the reflectance too."""
+    through = bent(d, n, eta)
+    if through is not None and dot(through, ng) >= 0.0:
+        n, through = ng, bent(d, ng, eta)
+    return Split(through, 1.0 if through is None else fresnel(clamp(abs(dot(d, n))), eta))
 
 
-def leaving(d: Vec, n: Vec, ng: Vec, ior: float) -> Split:
-    """From glass into air. `n` and `ng` stand outward, as `d` goes."""
-    through = bent(d, scaled(n, -1.0), ior)
-    if through is not None and dot(through, ng) <= 0.0:
-        through = None
-    share = 1.0 if through is None else fresnel(clamp(dot(through, n)), ior)
-    return Split(through, _kept(mirrored(d, n), d, ng, -1.0), share)
+def leaving(d: Vec, n: Vec, ng: Vec, eta: float) -> Split:
+    """Out of a body, `n` and `ng` inward, on the ray's side."""
+    through = bent(d, n, eta)
+    if through is None or dot(through, ng) >= 0.0:
+        return Split(None, 1.0)
+    return Split(through, fresnel(clamp(abs(dot(d, n))), eta))
 
 
-def _kept(r: Vec, d: Vec, ng: Vec, side: float) -> Vec:
-    """A reflection that stays on its side of the surface: by the geometric normal where the shading normal fails."""
-    return r if dot(r, ng) * side > 0.0 else mirrored(d, ng)
+def glanced(d: Vec, n: Vec, ng: Vec) -> Vec:
+    """A reflection that stays on its side: by the true normal where the shading normal fails."""
+    r = mirrored(d, n)
+    return r if dot(r, ng) > 0.0 else mirrored(d, ng)
 
 
 # --- Closed models ----------------------------------------------------------------------------------------------------

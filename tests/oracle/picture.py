@@ -1,4 +1,4 @@
-"""One pixel: the camera's ray, the opaque surface it ends on, the glass it enters on the way, and their sum."""
+"""One pixel: the camera's ray, what it meets without any glass, the tree that grows from it, and their sum."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from refract_core.scene import Camera, Model, Param, Scene
+from refract_core.scene import Camera, Scene
 from refract_core.settings import RenderSettings
 
-from . import optics, sampling
-from .screen import NOTHING, Found, by_proxy
-from .shading import Shader, View, diffuse, ray_bits
-from .surface import Surface, number, surface_at
-from .tiers import Answer, Leaf, ask
-from .vec import ZERO, Vec, add, at, clamp, dot, mul, scaled, sub, unit, vec
-from .walk import Entry, Exit, Status, entry_at, exit_of
-from .world import GLASS, OPAQUE, Hit, all_present, first
+from . import sampling
+from .media import Media, media_around
+from .screen import Found, by_proxy
+from .shading import Shader, View, ray_bits
+from .tiers import Leaf
+from .tree import End, Grown, Ray, Tree
+from .vec import ZERO, Vec, add, at, dot, scaled, sub, unit, vec
+from .world import OPAQUE, Hit, first
 
 Channels = list[float]
 
@@ -30,8 +30,8 @@ class Pixel:
     unsure: bool = False
 
 
-class Ray(NamedTuple):
-    """Of the camera."""
+class Sight(NamedTuple):
+    """A ray of the camera."""
 
     origin: Vec
     direction: Vec
@@ -41,20 +41,9 @@ class Ray(NamedTuple):
     far: float
 
 
-class Layer(NamedTuple):
-    """One refractive surface, composited."""
-
-    color: Vec
-    alpha: float
-    refraction: Vec
-    reflection: Vec
-    surface: Surface
-    entry: Entry
-    exit: Exit
-    answer: Answer
-
-
 _WEIGHTS = ("screen", "ray", "probe", "sky", "none")
+_CLOSE = 1e-5
+"""Relative: of two leaves whose weights are nearer than this, float32 may find either the stronger."""
 
 
 class Oracle:
@@ -74,6 +63,8 @@ class Oracle:
         """how much wider a pixel's cone gets per metre"""
         self.marches = "screen" in settings.tiers
         """What is mirrored is marched for, which is not known here: planes that hold reflections are left out."""
+        self.around: Media = () if self.camera.orthographic else media_around(self.shader, self.eye, settings.model)
+        self.cut: float = getattr(settings, "cut", 0.02)
         if self.marches and (settings.screen != "proxy" or settings.max_layers > 1 or len(scene.probes) != 1):
             raise NotImplementedError("the screen is known by proxy, with one layer and one probe that lends its proxy")
         self._seen: dict[tuple[int, int, int], tuple[Vec, float, float]] = {}
@@ -91,7 +82,7 @@ class Oracle:
 
     # --- The camera ---
 
-    def ray(self, px: float, py: float) -> Ray:
+    def ray(self, px: float, py: float) -> Sight:
         """Through continuous pixel coordinates, y down."""
         left, right, bottom, top = self.window
         x = left + (right - left) * px / self.size[0]
@@ -99,127 +90,73 @@ class Oracle:
         aside = add(scaled(self.right, x), scaled(self.up, y))
         near, far = self.camera.clipping
         if self.camera.orthographic:
-            return Ray(add(self.eye, aside), self.forward, 1.0, near, far)
+            return Sight(add(self.eye, aside), self.forward, 1.0, near, far)
         d = unit(add(self.forward, aside))
         cosine = dot(d, self.forward)
-        return Ray(self.eye, d, cosine, near / cosine, far / cosine)
+        return Sight(self.eye, d, cosine, near / cosine, far / cosine)
 
     # --- One sample ---
 
     def _add_sample(self, sums: _Sums, x: int, y: int, k: int, nudge: tuple[float, float]) -> None:
-        ray, view = self._through(x, y, k, nudge)
-        opaque = self._first_opaque(ray, view)
-        entries = self._entries(ray, view, ray.far if opaque is None else opaque.t)
-        alpha, color, z, n = self._backdrop(ray, view, opaque)
-        layers = [self._layer(ray, view, hit) for hit in entries]
-        for layer in reversed(layers):
-            color, alpha = layer.color, layer.alpha
-        sums.add("beauty", [*color, alpha])
-        if layers:
-            self._note_glass(sums, layers[0], k)
-            z, n = entries[0].t * ray.cosine, layers[0].surface.ns
+        sight, view = self._through(x, y, k, nudge)
+        tree = Tree(self.shader, self.settings, self.cut, self.spread, self._on_screen(sight))
+        ray = Ray(sight.origin, sight.direction, sight.near, sight.far, media=self.around)
+        grown = tree.grow(ray, view, lambda hit: self._backdrop(sight, view, hit))
+        sums.add("beauty", [*grown.color, 1.0 - grown.missing])
+        if grown.glassy:
+            self._note_glass(sums, grown, k)
         if k == 0:
-            sums.keep("layers", [float(len(layers))])
-            sums.keep("Z", [z])
+            front, bare = grown.front, grown.bare
+            t, n = (front.t, front.n) if front is not None else (math.inf, ZERO) if bare is None else (
+                bare.t, bare.ng if dot(bare.ng, sight.direction) <= 0.0 else scaled(bare.ng, -1.0)
+            )  # fmt: skip
+            sums.keep("Z", [t * sight.cosine])
             sums.keep("N", list(n))
 
-    def _through(self, x: int, y: int, k: int, nudge: tuple[float, float] = (0.0, 0.0)) -> tuple[Ray, View]:
+    def _through(self, x: int, y: int, k: int, nudge: tuple[float, float] = (0.0, 0.0)) -> tuple[Sight, View]:
         jx, jy = sampling.jitter(k)
         px, py = x + 0.5 + jx, y + 0.5 + jy
         straight = self.ray(px, py)
         view = View((x, y, 0), k, ray_bits(straight.origin, straight.direction))
         return self.ray(px + nudge[0], py + nudge[1]), view
 
-    def _first_opaque(self, ray: Ray, view: View) -> Hit | None:
-        hits = self.shader.world.candidates(ray.origin, ray.direction, ray.near, ray.far, OPAQUE)
-        return first(hits, lambda h: self.shader.present(h, ray.origin, ray.direction, view.bits))
+    def _first_opaque(self, sight: Sight, view: View) -> Hit | None:
+        hits = self.shader.world.candidates(sight.origin, sight.direction, sight.near, sight.far, OPAQUE)
+        return first(hits, lambda h: self.shader.present(h, sight.origin, sight.direction, view.bits))
 
-    def _entries(self, ray: Ray, view: View, until: float) -> list[Hit]:
-        """Refractive surfaces that the ray enters, nearest first: either side of a pane, the outside of a solid."""
-        hits = self.shader.world.candidates(ray.origin, ray.direction, ray.near, until, GLASS)
-        seen = all_present(hits, lambda h: self.shader.present(h, ray.origin, ray.direction, view.bits))
-        entered = [h for h in seen if self._enters(h, ray.direction)]
-        return [self._with_width(h) for h in entered[: self.settings.max_layers]]
-
-    def _enters(self, hit: Hit, d: Vec) -> bool:
-        pane = hit.face.sheet or self.shader.world.material(hit).model is Model.THIN
-        return pane or dot(hit.ng, d) < 0.0
-
-    def _with_width(self, hit: Hit) -> Hit:
-        return hit._replace(width=self.spread * hit.t)
-
-    def _backdrop(self, ray: Ray, view: View, hit: Hit | None) -> tuple[float, Vec, float, Vec]:
-        """Alpha, colour, depth and normal of what stands behind all glass."""
+    def _backdrop(self, sight: Sight, view: View, hit: Hit | None) -> tuple[Vec, float]:
+        """Colour and alpha of what stands behind all glass."""
         if hit is not None:
-            color = self.shader.radiance(self._with_width(hit), ray.direction, view.key, view.sample)
-            ng = hit.ng if dot(hit.ng, ray.direction) <= 0.0 else scaled(hit.ng, -1.0)
-            return 1.0, color, hit.t * ray.cosine, ng
+            hit = hit._replace(width=self.spread * hit.t)
+            return self.shader.radiance(hit, sight.direction, view.key, view.sample), 1.0
         if self.shader.sky is not None:
-            return 1.0, self.shader.sky.radiance(ray.direction, 0.0), math.inf, ZERO
-        return 0.0, ZERO, math.inf, ZERO
-
-    # --- Glass ---
-
-    def _layer(self, ray: Ray, view: View, hit: Hit) -> Layer:
-        """What comes through replaces the diffuse light by 1 - opacity; reflection and highlights are added whole."""
-        s = surface_at(self.scene, hit, scaled(ray.direction, -1.0))
-        if dot(s.ns, ray.direction) >= 0.0:
-            s = s._replace(ns=s.ng)
-        gathered = self.shader.gather(s, view.key, view.sample)
-        entry = entry_at(self.scene, hit, self.settings.model)
-        through, exit_, answer = self._transmitted(s, entry, view, hit.t * ray.cosine)
-        share = optics.fresnel(clamp(dot(s.ns, s.wo)), entry.medium.ior)
-        m = self.scene.materials[hit.face.material]
-        opacity = clamp(number(self.scene, hit, m, Param.OPACITY))
-        clear = (1.0 - opacity) * (1.0 - share)
-        refraction = scaled(through, clear)
-        reflection = add(scaled(self._reflected(s, view).color, share), gathered.highlights)
-        color = add(add(refraction, reflection), scaled(diffuse(s, gathered), opacity))
-        return Layer(color, 1.0 - answer.none * clear, refraction, reflection, s, entry, exit_, answer)
-
-    def _transmitted(self, s: Surface, entry: Entry, view: View, z: float) -> tuple[Vec, Exit, Answer]:
-        """Light from behind, channel by channel under dispersion; the green ray stands for all in the data planes."""
-        indices = optics.iors(entry.medium.ior, entry.abbe)
-        hdrp = self.settings.screen == "proxy"
-        rough = optics.transmitted_roughness(s.roughness, entry.medium.ior)
-        found = {}
-        for ior in set(indices):
-            exit_ = exit_of(self.shader, s, entry, ior, measured=not hdrp)
-            seen_as = s.roughness if hdrp else rough
-            embedded = exit_.status is Status.EMBEDDED
-            leaf = Leaf(exit_.point, exit_.direction, _tangent(rough), seen_as, embedded)
-            found[ior] = exit_, ask(self.shader, leaf, self.settings.tiers, view, self._on_screen(leaf, view, z))
-        light = [mul(found[ior][1].color, found[ior][0].transmittance)[c] for c, ior in enumerate(indices)]
-        return vec(light), *found[indices[1]]
-
-    def _reflected(self, s: Surface, view: View) -> Answer:
-        r = optics.mirrored(scaled(s.wo, -1.0), s.ns)
-        if dot(r, s.ng) <= 0.0:
-            r = optics.mirrored(scaled(s.wo, -1.0), s.ng)
-        tiers = tuple(tier for tier in self.settings.tiers if tier != "screen")
-        leaf = Leaf(s.point, r, _tangent(s.roughness), s.roughness)
-        return ask(self.shader, leaf, tiers, view, lambda: NOTHING)
+            return self.shader.sky.radiance(sight.direction, 0.0), 1.0
+        return ZERO, 0.0
 
     # --- The screen ---
 
-    def _on_screen(self, leaf: Leaf, view: View, z: float) -> Callable[[], Found]:
+    def _on_screen(self, sight: Sight) -> Callable[[Leaf, View, float], Callable[[], Found]]:
         """By the proxy of the scene's probe."""
 
-        def look(column: int, row: int) -> tuple[Vec, float, float]:
-            return self._opaque_at(column, row, view.sample)
+        def asked(leaf: Leaf, view: View, t: float) -> Callable[[], Found]:
+            def look(column: int, row: int) -> tuple[Vec, float, float]:
+                return self._opaque_at(column, row, view.sample)
 
-        own = (view.key[0] + 0.5, view.key[1] + 0.5, z)
-        return lambda: by_proxy(
-            leaf.origin, leaf.direction, self.scene.probes[0].proxy, self.size, own, look,
-            lambda p: self._project(p, view.sample),
-        )  # fmt: skip
+            own = (view.key[0] + 0.5, view.key[1] + 0.5, t * sight.cosine)
+            return lambda: by_proxy(
+                leaf.origin, leaf.direction, self.scene.probes[0].proxy, self.size, own, look,
+                lambda p: self._project(p, view.sample),
+            )  # fmt: skip
+
+        return asked
 
     def _opaque_at(self, x: int, y: int, k: int) -> tuple[Vec, float, float]:
         """Colour, depth and coverage of the picture without its glass."""
         if (x, y, k) not in self._seen:
-            ray, view = self._through(x, y, k)
-            alpha, color, z, _ = self._backdrop(ray, view, self._first_opaque(ray, view))
-            self._seen[x, y, k] = color, z, alpha
+            sight, view = self._through(x, y, k)
+            hit = self._first_opaque(sight, view)
+            color, alpha = self._backdrop(sight, view, hit)
+            self._seen[x, y, k] = color, math.inf if hit is None else hit.t * sight.cosine, alpha
         return self._seen[x, y, k]
 
     def _project(self, p: Vec, k: int) -> tuple[float, float, float]:
@@ -235,19 +172,32 @@ class Oracle:
 
     # --- Planes ---
 
-    def _note_glass(self, sums: _Sums, front: Layer, k: int) -> None:
-        answer, exit_ = front.answer, front.exit
+    def _note_glass(self, sums: _Sums, grown: Grown, k: int) -> None:
         sums.add("mask", [1.0])
-        shares = (answer.screen, answer.ray, 0.0, answer.sky, answer.none)
-        for name, w in zip(_WEIGHTS, shares, strict=True):
-            sums.add(f"weight.{name}", [w])
-        sums.add("refraction", list(front.refraction))
-        sums.add("reflection", list(front.reflection))
-        sums.add("transmittance", list(exit_.transmittance))
-        sums.add("confidence", [answer.confidence if exit_.status is not Status.LOST else 0.0])
+        sums.add("refraction", list(grown.refraction))
+        sums.add("reflection", list(grown.reflection))
+        strengths = [sum(end.ray.clear) / 3.0 for end in grown.ends]
+        total = sum(strengths)
+        for s, end in zip(strengths, grown.ends, strict=True):
+            share, answer = s / total, end.answer
+            for name, w in zip(_WEIGHTS, (answer.screen, answer.ray, 0.0, answer.sky, answer.none), strict=True):
+                sums.add(f"weight.{name}", [share * w])
+            sums.add("confidence", [0.0 if end.lost else share * answer.confidence])
+        sums.add("transmittance", [_left(grown.ends, c) for c in range(3)])
         if k == 0:
-            sums.keep("thickness", [front.entry.thickness])
-            sums.keep("path_length", [exit_.path])
+            sums.keep("thickness", [grown.front.thickness if grown.front is not None else 0.0])
+            if grown.ends:
+                self._note_strongest(sums, strengths, grown.ends)
+
+    def _note_strongest(self, sums: _Sums, strengths: list[float], ends: list[End]) -> None:
+        most = max(strengths)
+        way, layers = next((end.ray.way, end.ray.entered) for s, end in zip(strengths, ends, strict=True) if s == most)
+        for s, end in zip(strengths, ends, strict=True):
+            apart = end.ray.entered != layers or abs(end.ray.way - way) > _CLOSE * way
+            if s > most * (1.0 - _CLOSE) and apart:
+                self.shader.unsure = True
+        sums.keep("path_length", [way])
+        sums.keep("layers", [float(layers)])
 
     def _finished(self, sums: _Sums, x: int, y: int) -> dict[str, Channels]:
         """Means; colours by exposure, lengths in the stage's units, places and normals in its world."""
@@ -297,9 +247,10 @@ class _Sums:
         return self._planes.get(name, [0.0] * count)
 
 
-def _tangent(roughness: float) -> float:
-    """Of the half angle of a lobe's cone: twice the median slope, which is alpha."""
-    return 2.0 * roughness**2
+def _left(ends: list[End], c: int) -> float:
+    """Share of a channel's light that absorption leaves on its ways through."""
+    clear = sum(end.ray.clear[c] for end in ends)
+    return sum(end.ray.weight[c] for end in ends) / clear if clear > 0.0 else 1.0
 
 
 def _conformed(window: tuple[float, float, float, float], width: int, height: int) -> tuple[float, float, float, float]:

@@ -18,12 +18,16 @@ _PLASTIC = 1.3247179572447460  # the real root of x^3 = x + 1; R2 steps by its i
 _WORD = 0xFFFFFFFF
 
 
+MIRRORED, THROUGH, GLANCED = 1, 2, 3
+"""How a branch goes on: off an opaque surface, through glass, back from glass."""
+
+
+def branched(branch: int, step: int) -> int:
+    return 4 * branch + step
+
+
 def mirror_key(key: Key) -> Key:
-    return key[0], key[1], 4 * key[2] + 1
-
-
-def leaf_key(key: Key) -> Key:
-    return key[0], key[1], 4 * key[2] + 2
+    return key[0], key[1], branched(key[2], MIRRORED)
 
 
 def hashed(x: int, y: int, z: int) -> int:

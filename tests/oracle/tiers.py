@@ -1,4 +1,4 @@
-"""Who answers a ray that has left the glass, in the order of the settings, until all of its weight is spoken for."""
+"""Who answers a ray that has ended, in the order of the settings, until all of its weight is spoken for."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .optics import scattered
 from .screen import NOTHING, Found
 from .shading import Shader, View
 from .vec import ZERO, Vec, add, scaled
-from .world import OPAQUE
+from .world import OPAQUE, Hit
 
 
 class Leaf(NamedTuple):
@@ -22,7 +22,10 @@ class Leaf(NamedTuple):
     """tangent of the half angle of its cone"""
     roughness: float
     """the sky's, as the eye sees it"""
-    embedded: bool = False
+    hit: Hit | None
+    """what it ended on"""
+    embedded: bool
+    """in a medium, where nobody can guess better than a ray"""
 
 
 class Answer(NamedTuple):
@@ -37,7 +40,7 @@ class Answer(NamedTuple):
 
 
 def ask(shader: Shader, leaf: Leaf, order: tuple[str, ...], view: View, on_screen: Callable[[], Found]) -> Answer:
-    """`ray` meets the opaque scene, `sky` is the environment. What lies inside the glass is always asked by ray."""
+    """`ray` meets the opaque scene, `sky` is the environment. `view`: with the branch of the ray that ended."""
     color, left, confidence = ZERO, 1.0, 0.0
     shares = {"screen": 0.0, "ray": 0.0, "sky": 0.0}
     for tier in ("ray", *order) if leaf.embedded else order:
@@ -66,10 +69,9 @@ def _answer(shader: Shader, leaf: Leaf, tier: str, view: View, on_screen: Callab
 
 
 def _by_ray(shader: Shader, leaf: Leaf, view: View) -> Vec | None:
-    d = leaf.direction
+    """What a sharp ray has met anyway; of a blurred one, a ray of its lobe."""
+    d, hit = leaf.direction, leaf.hit
     if leaf.blur > 0.0:
         d = scattered(d, leaf.blur, *sampling.pair(view.key, view.sample, sampling.ROUGH_LEAF))
-    hit = shader.nearest(leaf.origin, d, OPAQUE)
-    return None if hit is None else shader.radiance(hit, d, sampling.leaf_key(view.key), view.sample)
-
-
+        hit = shader.nearest(leaf.origin, d, OPAQUE)
+    return None if hit is None else shader.radiance(hit._replace(width=0.0), d, view.key, view.sample)

@@ -1,0 +1,457 @@
+"""A pixel's rays: at every interface light goes both ways, and every ray that ends asks the tiers.
+
+The rules are numbered as in docs/decisions/one-tree.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import NamedTuple
+
+from refract_core.scene import Model, Param
+from refract_core.settings import RenderSettings
+
+from . import optics, sampling
+from .media import (
+    MOST,
+    Media,
+    Medium,
+    disperses,
+    filling,
+    index,
+    medium_at,
+    model_at,
+    thickness_at,
+    without,
+)
+from .optics import Passage, Split, absorbed
+from .screen import NOTHING, Found
+from .shading import Shader, View, diffuse
+from .surface import Surface, number, surface_at
+from .tiers import Answer, Leaf, ask
+from .vec import ZERO, Vec, add, clamp, dot, mul, scaled, sub, unit
+from .world import GLASS, NEAR, OPAQUE, Hit, first
+
+_MOST_MET = 64
+_FORGOTTEN = 8
+"""After so many interfaces, each of which may double an error, float32 does not say any more where a ray is."""
+_HEEDED = 1e-3
+"""Of a pixel's light; what weighs less may be elsewhere, or not be."""
+_CLOSE = 1e-5
+"""Relative: numbers nearer than this may compare the other way in float32."""
+_CONTACT = (4e-5, 4e-6)
+"""Glass stands on a table where they are nearer than this: relative to the place, and in metres."""
+
+WHITE: Vec = (1.0, 1.0, 1.0)
+
+
+class Side(Enum):
+    """Of the first interface, which way a ray has gone there."""
+
+    VIEW = 0
+    """has met none"""
+    THROUGH = 1
+    MIRRORED = 2
+
+
+class Step(Enum):
+    """What a surface of glass is to a ray."""
+
+    PANE = 3
+    TYPED = 4
+    ENTERS = 5
+    LEAVES = 6
+    PASSES = 7
+
+
+class Inner(NamedTuple):
+    """A typed model's way, while a ray looks along it."""
+
+    body: Medium
+    passage: Passage
+
+
+class Ray(NamedTuple):
+    origin: Vec
+    direction: Vec
+    start: float = 0.0
+    """along the direction, from where it looks [m]"""
+    far: float = math.inf
+    weight: Vec = WHITE
+    clear: Vec = WHITE
+    """the weight without absorption"""
+    channel: int = -1
+    """the only one it carries; -1: all"""
+    media: Media = ()
+    side: Side = Side.VIEW
+    blur: float = 0.0
+    """tangent of the half angle of its cone"""
+    roughness: float = 0.0
+    entered: int = 0
+    met: int = 0
+    way: float = 0.0
+    """inside media, so far [m]"""
+    branch: int = 0
+    inner: Inner | None = None
+
+    def absorb(self, length: float) -> Ray:
+        """A stretch of what fills the space."""
+        medium = filling(self.media)
+        if medium is None:
+            return self
+        left = absorbed(medium.tint, medium.distance, length)
+        return self._replace(weight=mul(self.weight, left), way=self.way + length)
+
+    def passed(self, t: float, media: Media) -> Ray:
+        """On behind a surface that is nothing to it."""
+        return self._replace(start=t, media=media, met=self.met + 1)
+
+
+class End(NamedTuple):
+    """A leaf, answered."""
+
+    ray: Ray
+    answer: Answer
+    lost: bool
+
+
+class Front(NamedTuple):
+    """The first surface that was entered or left."""
+
+    t: float
+    n: Vec
+    thickness: float
+
+
+@dataclass
+class Grown:
+    """What the tree of one sample brings."""
+
+    color: Vec = ZERO
+    refraction: Vec = ZERO
+    reflection: Vec = ZERO
+    missing: float = 0.0
+    ends: list[End] = field(default_factory=list)
+    """of rays that went through"""
+    front: Front | None = None
+    bare: Hit | None = None
+    """what the view ray ended on"""
+    glassy: bool = False
+
+    def gain(self, side: Side, light: Vec) -> None:
+        self.color = add(self.color, light)
+        if side is Side.MIRRORED:
+            self.reflection = add(self.reflection, light)
+        else:
+            self.refraction = add(self.refraction, light)
+
+
+class Choice(NamedTuple):
+    """What a hit is to a ray: the ray as it arrives, the step, the body's own medium, the media behind."""
+
+    ray: Ray
+    step: Step
+    body: Medium | None
+    behind: Media
+
+
+OnScreen = Callable[[Leaf, View, float], Callable[[], Found]]
+Light = Callable[[Hit | None], tuple[Vec, float]]
+"""Colour and alpha of what a view ray meets without any glass."""
+
+
+class Tree:
+    """Grows one sample's tree."""
+
+    def __init__(
+        self, shader: Shader, settings: RenderSettings, cut: float, spread: float, on_screen: OnScreen
+    ) -> None:
+        self.shader, self.scene, self.settings = shader, shader.scene, settings
+        self.cut, self.spread, self.on_screen = cut, spread, on_screen
+        self.by_proxy = settings.screen == "proxy"
+
+    def grow(self, ray: Ray, view: View, light: Light) -> Grown:
+        grown = Grown(glassy=bool(ray.media))
+        waiting = [ray]
+        while waiting:
+            ray = waiting.pop()
+            waiting.extend(reversed(self._go(ray, view, light, grown)))
+        return grown
+
+    def _go(self, ray: Ray, view: View, light: Light, grown: Grown) -> list[Ray]:
+        """One ray to the next thing that it meets; the rays that go on from there."""
+        if ray.met >= _MOST_MET:
+            self._end(ray, None, view, grown, lost=True)
+            return []
+        hit = self._met(ray, view)
+        if hit is None and ray.inner is not None:
+            return [_out(ray.absorb(ray.far - ray.start), ray.inner)]
+        if hit is None or hit.face.kind == OPAQUE:
+            if ray.side is Side.VIEW:
+                grown.bare = hit
+            if ray.side is Side.VIEW and not grown.glassy:
+                grown.color, alpha = light(hit)
+                grown.missing = 1.0 - alpha
+            else:
+                self._end(ray, hit, view, grown)
+            return []
+        choice = self._choice(ray, hit)
+        ray = choice.ray.absorb(hit.t - ray.start)
+        if choice.step is Step.PASSES:
+            return [ray.passed(hit.t, choice.behind)]
+        return self._split(ray, hit, choice, view, grown)
+
+    # --- What it meets ---
+
+    def _met(self, ray: Ray, view: View) -> Hit | None:
+        bare = not ray.media and ray.entered >= self.settings.max_layers
+        kinds = OPAQUE if bare else OPAQUE | GLASS
+        hit = first(self._candidates(ray, ray.start, ray.far, kinds), self._present(ray, view))
+        if hit is None or hit.face.kind == OPAQUE:
+            return hit
+        # Rule 2; and what a ray passes straight does not hide a table that is in the same place either.
+        if ray.media or self._choice(ray, hit).step is Step.PASSES:
+            near = _CONTACT[0] * max(abs(c) for c in hit.point) + _CONTACT[1]
+            touching = self._candidates(ray, max(0.0, hit.t - near), hit.t + near, OPAQUE)
+            hit = first(touching, self._present(ray, view)) or hit
+        return hit
+
+    def _candidates(self, ray: Ray, start: float, far: float, kinds: int) -> list[Hit]:
+        hits = self.shader.world.candidates(ray.origin, ray.direction, start + NEAR, far, kinds)
+        if ray.side is not Side.VIEW:
+            return hits
+        return [hit._replace(width=self.spread * hit.t) for hit in hits]
+
+    def _present(self, ray: Ray, view: View) -> Callable[[Hit], bool]:
+        bits = view.bits if ray.side is Side.VIEW else None
+        return lambda hit: self.shader.present(hit, ray.origin, ray.direction, bits)
+
+    def _choice(self, ray: Ray, hit: Hit) -> Choice:
+        """Rules 3 to 7."""
+        thing, media = hit.face.thing, ray.media
+        inner = dot(hit.ng, ray.direction) > 0.0
+        model = model_at(self.scene, hit, self.settings.model)
+        within = any(m.thing == thing for m in media)
+        straight = Choice(ray, Step.PASSES, None, media)
+        if model is Model.THIN:
+            return Choice(ray, Step.PANE, medium_at(self.scene, hit, model), media)
+        outer = not inner if model is Model.TRACED else (not inner or hit.face.sheet) and not within
+        if outer:
+            if len(media) >= MOST:
+                return straight
+            body = medium_at(self.scene, hit, model)
+            behind = (*media, body)
+            if model is not Model.TRACED:
+                return Choice(ray, Step.TYPED, body, behind)
+            return Choice(ray, Step.ENTERS if filling(behind) is body else Step.PASSES, body, behind)
+        if inner and not within and self._is_cut(ray, hit, model):
+            media = (*media, medium_at(self.scene, hit, model))
+            within, ray = True, ray._replace(media=media)
+        given_up = ray.inner is None or ray.inner.body.thing != thing
+        if not (inner and within and given_up):
+            return straight
+        body, behind = without(media, thing)
+        return Choice(ray, Step.LEAVES if filling(media) is body else Step.PASSES, body, behind)
+
+    @staticmethod
+    def _is_cut(ray: Ray, hit: Hit, model: Model) -> bool:
+        """The near plane lies in the body."""
+        solid = model is Model.TRACED and not hit.face.sheet
+        return solid and ray.side is Side.VIEW and ray.met == 0 and len(ray.media) < MOST
+
+    # --- What an interface does ---
+
+    def _split(self, ray: Ray, hit: Hit, choice: Choice, view: View, grown: Grown) -> list[Ray]:
+        d, step = ray.direction, choice.step
+        s = surface_at(self.scene, hit, scaled(d, -1.0))
+        if step is not Step.LEAVES and dot(s.ns, d) >= 0.0:
+            s = s._replace(ns=s.ng)
+        model = model_at(self.scene, hit, self.settings.model)
+        if grown.front is None:
+            grown.front = Front(hit.t, s.ns, thickness_at(self.scene, hit, model))
+            grown.glassy = True
+        opacity = 0.0
+        if step is not Step.LEAVES:
+            m = self.scene.materials[hit.face.material]
+            opacity = clamp(number(self.scene, hit, m, Param.OPACITY))
+            self._shine(ray, s, opacity, view, grown)
+
+        before = filling(ray.media)
+        after = choice.body if step in (Step.PANE, Step.TYPED) else filling(choice.behind)
+        apart = ray.channel < 0 and (disperses(before) or disperses(after))
+        channels = (0, 1, 2) if apart else (ray.channel,)
+        ways = []
+        for c in channels:
+            eta = index(before, c) / index(after, c)
+            split = self._of_channel(ray, s, step, eta)
+            ways.append(_Way(c, _only(c) if apart else WHITE, 1.0 / eta, split))
+        mirrored = [way.split.reflectance for way in ways] * (1 if apart else 3)
+        whole = _Part(ray.weight, ray.clear)
+        back = whole.by((mirrored[0], mirrored[1], mirrored[2]))
+        through = [whole.by(scaled(w.mask, (1.0 - w.split.reflectance) * (1.0 - opacity))) for w in ways]
+        back, through = self._cut(back, through, ways)
+
+        rays = []
+        for way, part in zip(ways, through, strict=True):
+            if max(part.weight) > 0.0:
+                child = self._follower(ray, s, part, sampling.THROUGH)._replace(channel=way.channel)
+                rays.append(self._through(child, hit, s, choice, way))
+        if max(back.weight) > 0.0:
+            child = self._follower(ray, s, back, sampling.GLANCED)
+            blur = math.hypot(ray.blur, 2.0 * s.roughness**2)
+            rays.append(child._replace(direction=optics.glanced(d, s.ns, s.ng), blur=blur))
+        return rays
+
+    def _of_channel(self, ray: Ray, s: Surface, step: Step, eta: float) -> Split:
+        d = ray.direction
+        beyond = eta * eta * (1.0 - dot(d, s.ns) ** 2)
+        if eta > 1.0 and abs(1.0 - beyond) < _CLOSE and max(ray.weight) >= _HEEDED:
+            self.shader.unsure = True
+        if step is Step.LEAVES:
+            return optics.leaving(d, s.ns, s.ng, eta)
+        if step is Step.ENTERS:
+            return optics.entering(d, s.ns, s.ng, eta)
+        return Split(None, optics.fresnel(clamp(-dot(d, s.ns)), eta))
+
+    def _cut(self, back: _Part, through: list[_Part], ways: list[_Way]) -> tuple[_Part, list[_Part]]:
+        """What weighs too little goes the way of the rest. Channels that are totally reflected have no way through:
+        they stay mirrored."""
+        r, t = max(back.weight), max(sum(part.weight[c] for part in through) for c in range(3))
+        self._doubt(r, t)
+        if r < self.cut and r <= t:
+            rest = back
+            for k, way in enumerate(ways):
+                if way.split.reflectance < 1.0:
+                    through[k] = through[k].plus(back.by(way.mask))
+                    rest = rest.by(sub(WHITE, way.mask))
+            return rest, through
+        if t < self.cut and t < r:
+            for part in through:
+                back = back.plus(part)
+            return back, [_Part(ZERO, ZERO)] * len(through)
+        return back, through
+
+    def _doubt(self, r: float, t: float) -> None:
+        low, high = min(r, t), max(r, t)
+        if high < _HEEDED or low == 0.0:
+            return
+        if abs(low - self.cut) < _CLOSE * self.cut or (low < self.cut and high - low < _CLOSE * high):
+            self.shader.unsure = True
+
+    @staticmethod
+    def _follower(ray: Ray, s: Surface, part: _Part, step: int) -> Ray:
+        """What both ways have in common; as it is, it goes back into the media it came from."""
+        way = Side.THROUGH if step == sampling.THROUGH else Side.MIRRORED
+        return ray._replace(
+            origin=s.point, start=0.0, far=math.inf, weight=part.weight, clear=part.clear, inner=None,
+            side=way if ray.side is Side.VIEW else ray.side, roughness=max(ray.roughness, s.roughness),
+            met=ray.met + 1, branch=sampling.branched(ray.branch, step),
+        )  # fmt: skip
+
+    def _through(self, child: Ray, hit: Hit, s: Surface, choice: Choice, way: _Way) -> Ray:
+        step, body, bent = choice.step, choice.body, way.split.transmitted
+        if step is Step.LEAVES:
+            assert bent is not None
+            return child._replace(direction=bent, media=choice.behind)
+        assert body is not None
+        rough = 2.0 * optics.transmitted_roughness(s.roughness, body.ior) ** 2
+        child = child._replace(blur=math.hypot(child.blur, rough), entered=child.entered + 1)
+        if step is Step.ENTERS:
+            assert bent is not None
+            return child._replace(direction=bent, media=choice.behind)
+        model = model_at(self.scene, hit, self.settings.model)
+        passage = _passage(model, s, max(way.ratio, 1.0), thickness_at(self.scene, hit, model))
+        if step is Step.PANE:
+            left = absorbed(body.tint, body.distance, passage.path)
+            return child._replace(
+                weight=mul(child.weight, left), way=child.way + passage.path, origin=passage.point,
+                direction=passage.direction,
+            )  # fmt: skip
+        child = child._replace(media=choice.behind)
+        if self.by_proxy or passage.path == 0.0:
+            return _out(child.absorb(passage.path), Inner(body, passage))
+        inside = unit(sub(passage.point, s.point))
+        return child._replace(direction=inside, far=passage.path, inner=Inner(body, passage))
+
+    def _shine(self, ray: Ray, s: Surface, opacity: float, view: View, grown: Grown) -> None:
+        """Of the surface itself. What the first one sends out by itself is in neither of the planes."""
+        gathered = self.shader.gather(s, _key(view, ray), view.sample)
+        own = mul(ray.weight, scaled(diffuse(s, gathered), opacity))
+        highlights = mul(ray.weight, gathered.highlights)
+        if ray.side is Side.VIEW:
+            grown.color = add(grown.color, own)
+            grown.gain(Side.MIRRORED, highlights)
+        else:
+            grown.gain(ray.side, add(own, highlights))
+
+    # --- Leaves ---
+
+    def _end(self, ray: Ray, hit: Hit | None, view: View, grown: Grown, lost: bool = False) -> None:
+        embedded = hit is not None and bool(ray.media)
+        if hit is not None:
+            ray = ray.absorb(hit.t - ray.start)
+        if ray.met >= _FORGOTTEN and max(ray.weight) >= _HEEDED:
+            self.shader.unsure = True
+        back = ray.side is Side.MIRRORED
+        gloss = ray.roughness if self.by_proxy and not back else math.sqrt(min(1.0, 0.5 * ray.blur))
+        leaf = Leaf(ray.origin, ray.direction, ray.blur, gloss, hit, embedded)
+        own = view._replace(key=_key(view, ray))
+        tiers = tuple(t for t in self.settings.tiers if not (back and t == "screen"))
+        z = grown.front.t if grown.front is not None else math.inf
+        on_screen = (lambda: NOTHING) if back else self.on_screen(leaf, own, z)
+        answer = ask(self.shader, leaf, tiers, own, on_screen)
+        grown.gain(ray.side, mul(ray.weight, answer.color))
+        grown.missing += sum(ray.weight) / 3.0 * answer.none
+        if not back:
+            grown.ends.append(End(ray, answer, lost))
+
+
+class _Part(NamedTuple):
+    """Of a ray's weights."""
+
+    weight: Vec
+    clear: Vec
+
+    def by(self, share: Vec) -> _Part:
+        return _Part(mul(self.weight, share), mul(self.clear, share))
+
+    def plus(self, other: _Part) -> _Part:
+        return _Part(add(self.weight, other.weight), add(self.clear, other.clear))
+
+
+class _Way(NamedTuple):
+    """Through an interface, for one channel or for all."""
+
+    channel: int
+    mask: Vec
+    ratio: float
+    """index behind over index before"""
+    split: Split
+
+
+def _only(channel: int) -> Vec:
+    return (float(channel == 0), float(channel == 1), float(channel == 2))
+
+
+def _out(ray: Ray, inner: Inner) -> Ray:
+    """From a typed model's exit, out of its body."""
+    media = tuple(m for m in ray.media if m is not inner.body)
+    passage = inner.passage
+    return ray._replace(
+        origin=passage.point, direction=passage.direction, start=0.0, far=math.inf, media=media, inner=None
+    )
+
+
+def _passage(model: Model, s: Surface, ior: float, thickness: float) -> Passage:
+    if model is Model.SPHERE:
+        return optics.through_sphere(s.point, s.ns, s.wo, ior, thickness)
+    if model in (Model.BOX, Model.THIN):
+        return optics.through_slab(s.point, s.ns, s.wo, ior, thickness)
+    return Passage(0.0, s.point, scaled(s.wo, -1.0))
+
+
+def _key(view: View, ray: Ray) -> sampling.Key:
+    return view.key[0], view.key[1], ray.branch
