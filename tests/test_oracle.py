@@ -3,8 +3,9 @@
 The oracle computes in double precision without an acceleration structure; the engine's rays and hits are float32. So a
 pixel may differ where the picture itself is unsteady: the edge of a thing, of a shadow, of total reflection, of a texel
 that is repeated, seen directly or through glass. Such a pixel is let pass only if the oracle's own answer changes by
-half of the difference when it looks one or two thousandths of a pixel aside, or if its ray has met so many interfaces
-that no digit is left (`Pixel.unsure`); and no more than one pixel in fifty may need that.
+half of the difference when it looks one or two thousandths of a pixel aside, or if something that counts in it hangs on
+the last digits: a ray that has met so many interfaces that none is left, a weight that is just at the cut, an angle just
+at total reflection (`Pixel.unsure`); and no more than one pixel in fifty may need that.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ SCENES = 60
 _NUDGES = [
     (r * math.cos(k * math.pi / 4), r * math.sin(k * math.pi / 4)) for r in (1e-3, 2e-3) for k in range(8)
 ]
-"""As far aside as the offsets of 24 interfaces move a ray: each by 5e-6 m, where a pixel is 0.1 m wide."""
-# Relative, and below 0.1 absolute. Rays leave surfaces from 1e-5 of the place and 1e-6 m beside them, up to 24 times.
+"""As far aside as the offsets of some 24 interfaces move a ray: each by 5e-6 m, where a pixel is 0.1 m wide."""
+# Relative, and below 0.1 absolute. Rays leave surfaces from 1e-5 of the place and 1e-6 m beside them, many times over.
 _TOLERANCE, _SMALL = 1e-3, 0.1
 _LENGTHS = ("path_length", "Z", "P")
 _LENGTH_TOLERANCE = 5e-5  # [m]

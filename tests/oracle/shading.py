@@ -45,7 +45,8 @@ class Shader:
         self.sky = sky_of(scene.environment) if scene.environment is not None else None
         self.lamps = lights.lamps_of(scene, eye)
         self.unsure = False
-        """Something hung on the last bits of a ray: a chance decided by them, or a walk of many reflections."""
+        """Something hung on the last bits of a ray: a chance or a choice decided by them, a place behind many
+        reflections."""
 
     # --- Rays ---
 
