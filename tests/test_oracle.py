@@ -3,9 +3,9 @@
 The oracle computes in double precision without an acceleration structure; the engine's rays and hits are float32. So a
 pixel may differ where the picture itself is unsteady: the edge of a thing, of a shadow, of total reflection, of a texel
 that is repeated, seen directly or through glass. Such a pixel is let pass only if the oracle's own answer changes by
-half of the difference when it looks one or two thousandths of a pixel aside, or if something that counts in it hangs on
-the last digits: a ray that has met so many interfaces that none is left, a weight that is just at the cut, an angle just
-at total reflection (`Pixel.unsure`); and no more than one pixel in fifty may need that.
+half of the difference when it looks one or two thousandths of a pixel aside, or if something that counts in it hangs
+on the last digits: a ray that has met so many interfaces that none is left, a weight that is just at the cut, an angle
+just at total reflection (`Pixel.unsure`); and no more than one pixel in fifty may need that.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from oracle import Oracle, Pixel
+from oracle.optics import iors
 from scenes import (
     ROOM,
     box,
@@ -154,11 +155,30 @@ def _interface(n1: float, n2: float) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("ior", [1.1, 1.5, 2.4])
-def test_a_slab_reflects_two_f_over_one_plus_f(ior: float) -> None:
+@pytest.mark.parametrize("opacity", [0.0, 0.4])
+def test_a_slab_reflects_two_f_over_one_plus_f(ior: float, opacity: float) -> None:
+    """Clear; and with a face that lets only some of the light in, and shines by itself."""
     slab, f = box("/slab", (2.0, 2.0, 0.2), 2), _face(1.0, ior)
-    back, ahead = (middle(_between([slab], [glass(Model.TRACED, ior)], wall), 0.0) for wall in (BEHIND_CAMERA, AHEAD))
-    assert back["beauty"][0] == pytest.approx(2.0 * f / (1.0 + f), abs=1e-6)
-    assert ahead["beauty"][0] == pytest.approx((1.0 - f) / (1.0 + f), abs=1e-6)
+    stuff = glass(Model.TRACED, ior, OPACITY=opacity, EMISSIVE=0.3)
+    back, ahead = (middle(_between([slab], [stuff], wall), 0.0) for wall in (BEHIND_CAMERA, AHEAD))
+    let_in, own = 1.0 - opacity, 0.3 * opacity
+    assert back["beauty"][0] == pytest.approx(f + let_in * (1.0 - f) * f / (1.0 + f) + own, abs=1e-6)
+    assert ahead["beauty"][0] == pytest.approx(let_in * (1.0 - f) / (1.0 + f) + own, abs=1e-6)
+    assert ahead["refraction"][0] == pytest.approx(let_in * (1.0 - f) / (1.0 + f), abs=1e-6)
+    assert back["reflection"][0] == pytest.approx(f, abs=1e-6)
+
+
+@pytest.mark.parametrize("card_at", [0.1, 0.7])
+def test_a_typed_slab_is_as_deep_as_its_thickness(card_at: float) -> None:
+    """Whatever its mesh; or as deep as what stands in it."""
+    body, distance, f = box("/body", (2.0, 2.0, 1.0), 2, centre=(0, 0, -1.0)), 0.3, _face(1.0, 1.5)
+    card = quad("/card", [(-1, -1, -card_at), (1, -1, -card_at), (1, 1, -card_at), (-1, 1, -card_at)], 1)
+    stuff = glass(Model.BOX, 1.5, THICKNESS=0.4, TRANSMITTANCE=0.5, absorption_distance=distance)
+    planes = middle(_between([body, card], [stuff], AHEAD), 0.0)
+    way = min(card_at, 0.4)
+    assert planes["path_length"][0] == pytest.approx(way, rel=1e-5)
+    assert planes["beauty"][0] == pytest.approx((1.0 - f) * 0.5 ** (way / distance), rel=1e-5)
+    assert planes["layers"] == [1.0]
 
 
 def test_absorption_counts_once_a_pass() -> None:
@@ -178,7 +198,7 @@ def test_absorption_counts_once_a_pass() -> None:
 def test_overlapping_slabs_are_one_stack(priorities: tuple[int, int]) -> None:
     """Where two bodies share a space, one of them fills it: three interfaces, wherever the middle one comes to lie."""
     near, far = (box("/slab", (2.0, 2.0, 0.3), k, centre=(0, 0, z)) for k, z in ((2, 0.2), (3, -0.2)))
-    of = [replace(glass(Model.TRACED, n), priority=p) for n, p in zip((1.3, 2.0), priorities, strict=True)]
+    of = [glass(Model.TRACED, n, priority=p) for n, p in zip((1.3, 2.0), priorities, strict=True)]
     back, ahead = (middle(_between([near, far], of, wall), 1e-7) for wall in (BEHIND_CAMERA, AHEAD))
     r, t = reduce(_added, [_interface(1.0, 1.3), _interface(1.3, 2.0), _interface(2.0, 1.0)])
     assert back["beauty"][0] == pytest.approx(r, abs=1e-5)
@@ -189,11 +209,14 @@ def test_overlapping_slabs_are_one_stack(priorities: tuple[int, int]) -> None:
 def test_a_body_within_a_body_is_seen_unless_it_yields(priority: int) -> None:
     """A bubble of air, of lower priority than the glass around it, is not there; else it is four interfaces."""
     outer, inner = box("/outer", (2.0, 2.0, 0.6), 2), box("/bubble", (1.9, 1.9, 0.2), 3)
-    of = [glass(Model.TRACED, 1.8), replace(glass(Model.TRACED, 1.0), priority=priority)]
-    back = middle(_between([outer, inner], of, BEHIND_CAMERA), 1e-7)
+    skin: dict[str, Any] = {"OPACITY": 0.5, "EMISSIVE": 1.0} if priority < 0 else {}
+    of = [glass(Model.TRACED, 1.8), glass(Model.TRACED, 1.0, priority=priority, **skin)]
+    back, ahead = (middle(_between([outer, inner], of, wall), 1e-7) for wall in (BEHIND_CAMERA, AHEAD))
     wall = _interface(1.0, 1.8)
-    r, _ = reduce(_added, [wall, wall, wall, wall] if priority >= 0 else [wall, wall])
+    r, t = reduce(_added, [wall, wall, wall, wall] if priority >= 0 else [wall, wall])
     assert back["beauty"][0] == pytest.approx(r, abs=1e-5)
+    assert ahead["beauty"][0] == pytest.approx(t, abs=1e-5)
+    assert ahead["layers"] == [1.0 if priority < 0 else 2.0]
 
 
 def test_what_is_cut_is_not_lost() -> None:
@@ -215,10 +238,12 @@ def _sea(lens: Camera, **inputs: Any) -> Scene:
     return scene([*walls, water], [*materials, glass(Model.TRACED, **inputs)], cameras=(lens,))
 
 
-def test_snells_window() -> None:
-    """From under water, upwards: the world above in a cone of asin(1 / n), around it the mirrored ground."""
+@pytest.mark.parametrize("abbe", [0.0, 15.0])
+def test_snells_window(abbe: float) -> None:
+    """From under water, upwards: the world above in a cone of asin(1 / n), around it the mirrored ground; a channel at
+    a time where the water disperses."""
     lens = camera((0.1, -0.8, 0.2), (0.1, 1.0, 0.21), fov=1.4, aspect=WIDTH / HEIGHT, clipping=(1e-4, 100.0))
-    made = oracle_of(_sea(lens, ior=1.33), cut=1.0, tiers=("ray",))
+    made = oracle_of(_sea(lens, ior=1.33, abbe=abbe), cut=1.0, tiers=("ray",))
     origins, directions = view_rays(lens, WIDTH, HEIGHT)
     up = np.array([0.0, 1.0, 0.0])
     seen = {True: 0, False: 0}
@@ -228,16 +253,36 @@ def test_snells_window() -> None:
             surface = o + d * (0.0 - o[1]) / d[1]
             if max(abs(surface[0]), abs(surface[2])) > 2.0:
                 continue
-            out = snell(d, -up, 1.33)
-            seen[out is None] += 1
+            out = [snell(d, -up, n) for n in iors(1.33, abbe)]
             planes = made.pixel(x, y).planes
             assert planes["mask"] == [1.0]
-            if out is not None:
-                assert where(np.array(planes["beauty"])) == pytest.approx(wall_hit(surface, out), abs=1e-4)
-                assert sum(planes["reflection"]) == 0.0
-            else:
+            if all(way is None for way in out):
+                seen[False] += 1
                 assert sum(planes["refraction"]) == 0.0
+                continue
+            for c, way in enumerate(out):
+                if way is not None:
+                    seen[True] += 1
+                    place = wall_hit(surface, way)[c]
+                    assert where(np.array(planes["refraction"]))[c] == pytest.approx(place, abs=1e-4)
+            if all(way is not None for way in out):
+                assert sum(planes["reflection"]) == 0.0
     assert min(seen.values()) >= 8
+
+
+def test_the_eye_sees_what_is_with_it_in_the_water() -> None:
+    """The first thing met is none of the water's own surface."""
+    lens = camera((0.0, -1.0, 1.0), (0.0, -1.0, 0.0), fov=1e-3, clipping=(1e-7, 100.0))
+    sea = _sea(lens, ior=1.33, TRANSMITTANCE=0.5, absorption_distance=0.8)
+    card = quad("/card", [(-1, -2, 0.4), (1, -2, 0.4), (1, 0, 0.4), (-1, 0, 0.4)], len(sea.materials))
+    what = replace(sea, meshes=(*sea.meshes, card), materials=(*sea.materials, material("/card", EMISSIVE=0.7)))
+    planes = middle(what, 0.02)
+    left = 0.5 ** (0.6 / 0.8)
+    assert planes["beauty"] == pytest.approx([0.7 * left] * 3 + [1.0], rel=1e-5)
+    assert planes["refraction"] == pytest.approx([0.7 * left] * 3, rel=1e-5)
+    assert planes["transmittance"] == pytest.approx([left] * 3, rel=1e-5)
+    assert planes["path_length"] == pytest.approx([0.6], rel=1e-5)
+    assert (planes["mask"], planes["layers"], planes["weight.ray"]) == ([1.0], [0.0], [1.0])
 
 
 @pytest.mark.parametrize("orthographic", [False, True])
