@@ -310,10 +310,14 @@ def _cut(meeting: Meeting, lane: int, cut: float, late: bool) -> None:
         r = max(r, meeting.mirrored_weight[lane, c])
         t = max(t, meeting.weight[lane, c])
     if t > 0.0 and (r < cut or late):
-        for c in range(3):
-            meeting.weight[lane, c] += meeting.mirrored_weight[lane, c]
-            meeting.clear[lane, c] += meeting.mirrored_clear[lane, c]
         r = 0.0
+        for c in range(3):
+            if meeting.weight[lane, c] > 0.0:
+                meeting.weight[lane, c] += meeting.mirrored_weight[lane, c]
+                meeting.clear[lane, c] += meeting.mirrored_clear[lane, c]
+                meeting.mirrored_weight[lane, c] = meeting.mirrored_clear[lane, c] = 0.0
+            else:  # a channel that is totally reflected has no way through
+                r = max(r, meeting.mirrored_weight[lane, c])
     elif t < cut * _FAINT:
         for c in range(3):
             meeting.mirrored_weight[lane, c] += meeting.weight[lane, c]

@@ -35,7 +35,10 @@ from .tiers import Answer, Leaf, ask
 from .vec import ZERO, Vec, add, clamp, dot, mul, scaled, sub, unit
 from .world import GLASS, NEAR, OPAQUE, Hit, first
 
-_MOST_MET = 64
+_MOST_MET = 128
+_LATE = 96
+"""After so many a ray is let out at the next occasion."""
+_FAINT = 1.0 / 32.0
 _FORGOTTEN = 8
 """After so many interfaces, each of which may double an error, float32 does not say any more where a ray is."""
 _HEEDED = 1e-3
@@ -167,10 +170,10 @@ class Tree:
     """Grows one sample's tree."""
 
     def __init__(
-        self, shader: Shader, settings: RenderSettings, cut: float, spread: float, on_screen: OnScreen
+        self, shader: Shader, settings: RenderSettings, cut: float, spread: float, ahead: Vec, on_screen: OnScreen
     ) -> None:
         self.shader, self.scene, self.settings = shader, shader.scene, settings
-        self.cut, self.spread, self.on_screen = cut, spread, on_screen
+        self.cut, self.spread, self.ahead, self.on_screen = cut, spread, ahead, on_screen
         self.by_proxy = settings.screen == "proxy"
 
     def grow(self, ray: Ray, view: View, light: Light) -> Grown:
@@ -292,7 +295,7 @@ class Tree:
         whole = _Part(ray.weight, ray.clear)
         back = whole.by((mirrored[0], mirrored[1], mirrored[2]))
         through = [whole.by(scaled(w.mask, (1.0 - w.split.reflectance) * (1.0 - opacity))) for w in ways]
-        back, through = self._cut(back, through, ways)
+        back, through = self._cut(back, through, ways, ray.met)
 
         rays = []
         for way, part in zip(ways, through, strict=True):
@@ -302,7 +305,8 @@ class Tree:
         if max(back.weight) > 0.0:
             child = self._follower(ray, s, back, sampling.GLANCED)
             blur = math.hypot(ray.blur, 2.0 * s.roughness**2)
-            rays.append(child._replace(direction=optics.glanced(d, s.ns, s.ng), blur=blur))
+            entered = ray.entered + (step is not Step.LEAVES)
+            rays.append(child._replace(direction=optics.glanced(d, s.ns, s.ng), blur=blur, entered=entered))
         return rays
 
     def _of_channel(self, ray: Ray, s: Surface, step: Step, eta: float) -> Split:
@@ -316,29 +320,30 @@ class Tree:
             return optics.entering(d, s.ns, s.ng, eta)
         return Split(None, optics.fresnel(clamp(-dot(d, s.ns)), eta))
 
-    def _cut(self, back: _Part, through: list[_Part], ways: list[_Way]) -> tuple[_Part, list[_Part]]:
-        """What weighs too little goes the way of the rest. Channels that are totally reflected have no way through:
+    def _cut(
+        self, back: _Part, through: list[_Part], ways: list[_Way], met: int
+    ) -> tuple[_Part, list[_Part]]:
+        """What weighs too little goes the way of the rest, and what runs round for long is let out. Channels that are totally reflected have no way through:
         they stay mirrored."""
         r, t = max(back.weight), max(sum(part.weight[c] for part in through) for c in range(3))
         self._doubt(r, t)
-        if r < self.cut and r <= t:
+        if t > 0.0 and (r < self.cut or met >= _LATE):
             rest = back
             for k, way in enumerate(ways):
                 if way.split.reflectance < 1.0:
                     through[k] = through[k].plus(back.by(way.mask))
                     rest = rest.by(sub(WHITE, way.mask))
             return rest, through
-        if t < self.cut and t < r:
+        if t < self.cut * _FAINT:
             for part in through:
                 back = back.plus(part)
             return back, [_Part(ZERO, ZERO)] * len(through)
         return back, through
 
     def _doubt(self, r: float, t: float) -> None:
-        low, high = min(r, t), max(r, t)
-        if high < _HEEDED or low == 0.0:
+        if max(r, t) < _HEEDED:
             return
-        if abs(low - self.cut) < _CLOSE * self.cut or (low < self.cut and high - low < _CLOSE * high):
+        if abs(r - self.cut) < _CLOSE * self.cut or abs(t - self.cut * _FAINT) < _CLOSE * self.cut:
             self.shader.unsure = True
 
     @staticmethod
@@ -404,7 +409,8 @@ class Tree:
         on_screen = (lambda: NOTHING) if back else self.on_screen(leaf, own, z)
         answer = ask(self.shader, leaf, tiers, own, on_screen)
         grown.gain(ray.side, mul(ray.weight, answer.color))
-        grown.missing += sum(ray.weight) / 3.0 * answer.none
+        if dot(ray.direction, self.ahead) > 0.0:
+            grown.missing += sum(ray.weight) / 3.0 * answer.none
         if not back:
             grown.ends.append(End(ray, answer, lost))
 
