@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import secrets
+import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -57,6 +58,38 @@ def write_whole(path: str, data: bytes, error: type[RefractError]) -> None:
     """
     with replacing(path, error) as temporary:
         Path(temporary).write_bytes(data)
+
+
+@contextmanager
+def filling(folder: str, ours: Collection[str], error: type[RefractError]) -> Iterator[str]:
+    """A new folder beside `folder`, whose files become those of `folder` when the block ends well.
+
+    A folder that is not there yet appears whole. In one that is, each file is replaced in one step, and those of
+    `ours` that were not made anew are removed; other files stay.
+
+    Args:
+        ours: names of all files that may be made here.
+
+    Raises:
+        error: something cannot be written.
+    """
+    path = os.path.abspath(folder)
+    temporary = os.path.join(os.path.dirname(path), f".{os.path.basename(path)[:32]}.{secrets.token_hex(4)}")
+    try:
+        os.mkdir(temporary)
+        yield temporary
+        if os.path.isdir(path):
+            made = set(os.listdir(temporary))
+            for name in sorted(made):
+                os.replace(os.path.join(temporary, name), os.path.join(path, name))
+            for name in set(ours) - made:
+                Path(path, name).unlink(missing_ok=True)
+        else:
+            os.rename(temporary, path)
+    except OSError as reason:
+        raise error(f"{folder}: cannot be written: {reason.strerror or reason}; choose another place") from reason
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 @contextmanager

@@ -10,6 +10,7 @@ import sys
 
 from . import (  # noqa: F401  a command is known once its module is loaded
     bake,
+    compare,
     convert,
     inspect,
     node,

@@ -70,8 +70,35 @@ class Pixels(NamedTuple):
     """colours are not multiplied by alpha"""
 
 
+class Channels(NamedTuple):
+    """The first image of a file, channel by channel."""
+
+    pixels: NDArray[Any]
+    """shape (H, W, C), uint8 or float32: the display window"""
+    spec: Any
+    """OpenImageIO's description of the file"""
+
+
 def read_pixels(path: str, name: str) -> Pixels:
     """Decode the first image in a file; see `pictures.read_texture`."""
+    import OpenImageIO as oiio
+
+    pixels, spec = read_channels(path, name)
+    integer = spec.format.basetype not in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+    return Pixels(_rgba(pixels, spec), spec.nchannels, integer, is_straight(spec))
+
+
+def is_straight(spec: Any) -> bool:
+    """Colours are not multiplied by alpha, by OpenImageIO's description of a file."""
+    return bool(spec.get_int_attribute(STRAIGHT_ALPHA, 0))
+
+
+def read_channels(path: str, name: str) -> Channels:
+    """Decode the first image in a file with all its channels; 8-bit integers stay so, the rest becomes float32.
+
+    Raises:
+        ImageError: unreadable, damaged or too large.
+    """
     import OpenImageIO as oiio
 
     config = oiio.ImageSpec()
@@ -83,13 +110,10 @@ def read_pixels(path: str, name: str) -> Pixels:
         spec = file.spec()
         check_size(spec, name)
         small = spec.format.basetype in (oiio.UINT8, oiio.INT8)
-        integer = spec.format.basetype not in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
         pixels = file.read_image(0, 0, 0, spec.nchannels, oiio.UINT8 if small else oiio.FLOAT)
         if pixels is None:
             raise ImageError(f"{name}: damaged image: {reason(file.geterror(), path)}")
-        pixels = pixels.reshape(spec.height, spec.width, spec.nchannels)
-        straight = bool(spec.get_int_attribute(STRAIGHT_ALPHA, 0))
-        return Pixels(_rgba(_display_window(pixels, spec), spec), spec.nchannels, integer, straight)
+        return Channels(_display_window(pixels.reshape(spec.height, spec.width, spec.nchannels), spec), spec)
     finally:
         file.close()
 

@@ -12,7 +12,17 @@ from ..errors import ImageError, UsageError
 from ..files import check_place, write_whole
 from ..scene import F32, Texture
 from .aovs import AOVS, check_names, shape_of
-from .codec import HALF_MAX, STRAIGHT_ALPHA, encoded, exr_spec, extension_of, named_file, read_pixels, reason
+from .codec import (
+    HALF_MAX,
+    STRAIGHT_ALPHA,
+    encoded,
+    exr_spec,
+    extension_of,
+    named_file,
+    read_channels,
+    read_pixels,
+    reason,
+)
 from .srgb import srgb_decode, srgb_encode
 
 COLOR_SPACES = ("auto", "raw", "sRGB")
@@ -54,7 +64,66 @@ def read_texture(source: str | bytes, *, name: str, color_space: str) -> Texture
     return Texture(name, pixels)
 
 
+def read_planes(path: str) -> dict[str, F32]:
+    """A picture file as the planes of a frame: what `write_frame` wrote, or `beauty` of anybody's picture.
+
+    Args:
+        path: an .exr holds scene-linear light and whatever AOVs its channels are named after; of other formats 8-bit
+            and 16-bit colours are taken as sRGB.
+
+    Returns:
+        AOV name -> float32, shapes as `aovs.shape_of`; `beauty` is there always, scene-linear with premultiplied alpha.
+
+    Raises:
+        ImageError: unreadable, damaged, too large, or an .exr without R, G and B.
+    """
+    with named_file(path, path) as file:
+        if _extension(path) not in LAYERED:
+            rgba, _, integer, straight = read_pixels(file, path)
+            return {"beauty": _linear_premultiplied(rgba, integer, straight)}
+        pixels, spec = read_channels(file, path)
+    at = {name: column for column, name in enumerate(spec.channelnames)}
+    lacking = [name for name in "RGB" if name not in at]
+    if lacking:
+        raise ImageError(f"{path}: has no channel {lacking[0]}; give a picture with R, G and B")
+    planes = {}
+    for name, aov in AOVS.items():
+        if name != "beauty" and all(channel in at for channel in aov.channels):
+            plane = pixels[..., [at[channel] for channel in aov.channels]]
+            planes[name] = np.ascontiguousarray(plane[..., 0] if aov.scalar else plane, np.float32)
+    alpha = pixels[..., at["A"]] if "A" in at else np.ones(pixels.shape[:2], np.float32)
+    return {"beauty": np.dstack([*(pixels[..., at[c]] for c in "RGB"), alpha]).astype(np.float32), **planes}
+
+
+def _linear_premultiplied(rgba: NDArray[Any], integer: bool, straight: bool) -> F32:
+    """Pixels of a file as `beauty`, shape (H, W, 4)."""
+    out = rgba.astype(np.float32) / np.float32(255.0) if rgba.dtype == np.uint8 else rgba.astype(np.float32)
+    if integer:
+        out[..., :3] = srgb_decode(out[..., :3])
+    if straight:
+        out[..., :3] *= out[..., 3:]
+    return out
+
+
 # --- writing -----------------------------------------------------------------------------------------------------
+
+
+def png_bytes(rgb: NDArray[np.uint8]) -> bytes:
+    """A PNG file in memory.
+
+    Args:
+        rgb: shape (H, W, 3), as shown.
+
+    Raises:
+        ImageError: it cannot be encoded.
+    """
+    import OpenImageIO as oiio
+
+    spec = oiio.ImageSpec(rgb.shape[1], rgb.shape[0], 3, "uint8")
+    spec.attribute("DateTime", "")
+    spec.attribute("png:compressionLevel", _PNG_LEVEL)
+    spec.attribute("png:filter", _PNG_SUB)
+    return encoded("picture.png", np.ascontiguousarray(rgb), spec)
 
 
 def default_aovs(path: str, available: Sequence[str]) -> tuple[str, ...]:

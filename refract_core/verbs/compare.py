@@ -1,4 +1,4 @@
-"""How far one picture is from another: PSNR, and FLIP as a person would see it.
+"""How far one picture is from another: PSNR, SSIM, and FLIP as a person would see it.
 
 Pictures here are display-encoded: sRGB, shape (H, W, 3), values 0 .. 1, as they would be shown. `displayed` makes one
 from scene-linear light. FLIP is computed by NVIDIA's own library, which is an extra.
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import UsageError
 from ..images.srgb import srgb_encode
-from ..scene import F32
+from ..scene import F32, F64
 
 Picture = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
@@ -49,6 +49,70 @@ def psnr(test: Picture, truth: Picture, mask: Mask | None = None) -> float:
     return math.inf if mean == 0.0 else -10.0 * math.log10(mean)
 
 
+_LUMA = np.array([0.2126, 0.7152, 0.0722])
+"""Of display-encoded red, green and blue (ITU-R BT.709)."""
+_SSIM_WINDOW, _SSIM_SIGMA, _SSIM_K = 11, 1.5, (0.01, 0.03)
+
+
+def ssim_map(test: Picture, truth: Picture) -> F64:
+    """Structural similarity of every pixel's neighbourhood: 1 where nothing differs, -1 at the least.
+
+    On luma, with a window of 11 x 11 pixels under a Gaussian of 1.5 pixels, K1 = 0.01, K2 = 0.03 and a peak of 1 (Wang,
+    Bovik, Sheikh, Simoncelli: Image Quality Assessment: From Error Visibility to Structural Similarity, IEEE TIP 13(4),
+    2004). Beyond its edges a picture is mirrored.
+
+    Args:
+        test: shape (H, W, 3), display-encoded, 0 .. 1.
+        truth: the same.
+
+    Returns:
+        shape (H, W), float64.
+
+    Raises:
+        UsageError: as `psnr`.
+    """
+    _checked(test, truth, None)
+    x, y = (np.asarray(picture, np.float64) @ _LUMA for picture in (test, truth))
+    mean_x, mean_y, xx, yy, xy = (_windowed(plane) for plane in (x, y, x * x, y * y, x * y))
+    c1, c2 = (k * k for k in _SSIM_K)
+    luminance = (2.0 * mean_x * mean_y + c1) / (mean_x * mean_x + mean_y * mean_y + c1)
+    structure = (2.0 * (xy - mean_x * mean_y) + c2) / (xx - mean_x * mean_x + yy - mean_y * mean_y + c2)
+    found: F64 = luminance * structure
+    return found
+
+
+def ssim(test: Picture, truth: Picture, mask: Mask | None = None) -> float:
+    """Mean structural similarity. The map is made of the whole pictures; `mask` says which pixels are averaged.
+
+    Raises:
+        UsageError: as `psnr`.
+    """
+    chosen = _checked(test, truth, mask)
+    return float(np.mean(ssim_map(test, truth)[chosen]))
+
+
+def _windowed(plane: F64) -> F64:
+    """Mean of every pixel's window, shape (H, W)."""
+    reach = _SSIM_WINDOW // 2
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / _SSIM_SIGMA) ** 2)
+    weights /= weights.sum()
+    for axis in (0, 1):
+        around = [(reach, reach) if one == axis else (0, 0) for one in (0, 1)]
+        wide = np.pad(plane, around, mode="symmetric")
+        count = plane.shape[axis]
+        plane = sum(weights[k] * np.take(wide, range(k, k + count), axis) for k in range(_SSIM_WINDOW))
+    return plane
+
+
+def flip_lacks() -> str:
+    """Why FLIP cannot be computed here, and what to do; '' where it can."""
+    try:
+        import flip_evaluator  # noqa: F401
+    except ImportError:
+        return "FLIP needs the package 'flip-evaluator'; pip install 'usd-refract[bench]'"
+    return ""
+
+
 def flip_map(test: Picture, truth: Picture, pixels_per_degree: float = PIXELS_PER_DEGREE) -> F32:
     """LDR-FLIP of every pixel: 0 looks the same, 1 could not look more different (Andersson et al. 2020).
 
@@ -66,10 +130,10 @@ def flip_map(test: Picture, truth: Picture, pixels_per_degree: float = PIXELS_PE
     _checked(test, truth, None)
     if not (math.isfinite(pixels_per_degree) and pixels_per_degree > 0.0):
         raise UsageError(f"pixels_per_degree is {pixels_per_degree}; it must be above 0")
-    try:
-        import flip_evaluator
-    except ImportError as error:
-        raise UsageError("FLIP needs the package 'flip-evaluator'; pip install 'usd-refract[bench]'") from error
+    if lacks := flip_lacks():
+        raise UsageError(lacks)
+    import flip_evaluator
+
     pair = [np.ascontiguousarray(picture, np.float32) for picture in (truth, test)]
     found, _, _ = flip_evaluator.evaluate(
         *pair, "LDR", applyMagma=False, computeMeanError=False, parameters={"ppd": pixels_per_degree}

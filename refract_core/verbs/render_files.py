@@ -64,7 +64,7 @@ def render_files(order: Order, report: Report, cancel: Callable[[], bool], crew:
     from ..images.pictures import check_output, check_writable
     from ..usd.time_codes import frame_jobs
 
-    _settings({}, order.overrides)
+    chosen_settings({}, order.overrides)
     if order.complexity not in COMPLEXITIES:
         raise UsageError(f"--complexity is '{order.complexity}', not known; choose from {', '.join(COMPLEXITIES)}")
     with _flag():
@@ -124,7 +124,7 @@ def _render_jobs(
     found: list[Notice] = []
     if order.complexity != "low":
         found.append(Notice("--complexity", "subdivision is not done yet, so every complexity draws the same"))
-    settings = _settings(read_settings(stage, order.settings_prim, found), order.overrides)
+    settings = chosen_settings(read_settings(stage, order.settings_prim, found), order.overrides)
     tell(found)
     choices = settings, order.materials, order.aovs, order.color_correction
     shots = [_Shot(job.time_code, job.path, *choices, job is jobs[0]) for job in jobs]
@@ -242,7 +242,7 @@ def _stale(read: Callable[..., Scene], scene: Scene, settings: RenderSettings) -
     return stale_bakes(scene.probes, scene_at)
 
 
-def _settings(authored: Mapping[str, object], overrides: Mapping[str, object]) -> RenderSettings:
+def chosen_settings(authored: Mapping[str, object], overrides: Mapping[str, object]) -> RenderSettings:
     """Defaults, then what the stage authors, then what the caller says."""
     chosen: dict[str, Any] = {**authored, **overrides}
     if "image_width" in overrides and "image_height" not in overrides:
