@@ -62,9 +62,9 @@ def write_whole(path: str, data: bytes, error: type[RefractError]) -> None:
 
 @contextmanager
 def filling(folder: str, ours: Collection[str], error: type[RefractError]) -> Iterator[str]:
-    """A new folder beside `folder`, whose files become those of `folder` when the block ends well.
+    """A new folder, whose files become those of `folder` when the block ends well.
 
-    A folder that is not there yet appears whole. In one that is, each file is replaced in one step, and those of
+    Where `folder` is not there yet it appears whole. Where it is, each file is replaced in one step, and those of
     `ours` that were not made anew are removed; other files stay.
 
     Args:
@@ -74,7 +74,8 @@ def filling(folder: str, ours: Collection[str], error: type[RefractError]) -> It
         error: something cannot be written.
     """
     path = os.path.abspath(folder)
-    temporary = os.path.join(os.path.dirname(path), f".{os.path.basename(path)[:32]}.{secrets.token_hex(4)}")
+    above = path if os.path.isdir(path) else os.path.dirname(path)
+    temporary = os.path.join(above, f".{os.path.basename(path)[:32]}.{secrets.token_hex(4)}")
     try:
         os.mkdir(temporary)
         yield temporary

@@ -1,4 +1,4 @@
-"""PSNR and FLIP against what their definitions say, and what they refuse."""
+"""PSNR, SSIM and FLIP against what their definitions say, and what they refuse."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from refract_core import UsageError
-from refract_core.verbs.compare import displayed, flip, flip_map, psnr
+from refract_core.verbs.compare import displayed, flip, flip_map, psnr, ssim, ssim_map
 
 F32 = NDArray[np.float32]
 
@@ -64,10 +64,57 @@ def test_displayed_clips_and_encodes() -> None:
         (grey(0.5), grey(0.5), np.ones((24, 31), np.bool_), "shape"),
     ],
 )
-@pytest.mark.parametrize("measure", [psnr, flip])
+@pytest.mark.parametrize("measure", [psnr, ssim, flip])
 def test_what_makes_no_number_is_refused(measure: Any, test: F32, truth: F32, mask: Any, word: str) -> None:
     with pytest.raises(UsageError, match=word):
         measure(test, truth, mask)
+
+
+def noise(seed: int = 0, height: int = 24, width: int = 32) -> F32:
+    return np.random.default_rng(seed).uniform(0.2, 0.8, (height, width, 3)).astype(np.float32)
+
+
+def test_ssim_of_the_same_picture_is_one() -> None:
+    assert ssim(noise(), noise()) == pytest.approx(1.0, abs=1e-12)
+    np.testing.assert_allclose(ssim_map(noise(), noise()), 1.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("a", "b"), [(0.5, 0.6), (0.1, 0.9), (0.0, 1.0)])
+def test_ssim_of_even_pictures_is_what_is_left_of_their_means(a: float, b: float) -> None:
+    """Without structure (2 ab + C1) / (a^2 + b^2 + C1) is left, C1 = 0.01^2 (Wang et al. 2004, equation 6)."""
+    expected = (2 * a * b + 1e-4) / (a * a + b * b + 1e-4)
+    assert ssim(grey(a), grey(b)) == pytest.approx(expected, abs=1e-6)
+
+
+def test_ssim_of_a_fainter_pattern_is_what_is_left_of_its_contrast() -> None:
+    """For y = m + k (x - m) the second factor is (2 k v + C2) / ((1 + k^2) v + C2), v the window's variance, C2 = 0.03^2
+    (Wang et al. 2004, equation 13). With stripes of one pixel v is the same in every window, and so is the mean."""
+    signs = np.where(np.arange(32) % 2 == 0, 1.0, -1.0)
+    at = np.arange(-5, 6)
+    weights = np.exp(-0.5 * (at / 1.5) ** 2)
+    tilt = float((weights / weights.sum()) @ np.where(at % 2 == 0, 1.0, -1.0))  # of the window's mean, +- by parity
+    amplitude, k = 0.3, 0.25
+    stripes = np.broadcast_to(signs[None, :, None], (24, 32, 3))
+    x, y = (0.5 + a * stripes for a in (amplitude, amplitude * k))
+    v = amplitude**2 * (1.0 - tilt**2)
+    contrast = (2 * k * v + 9e-4) / ((1 + k * k) * v + 9e-4)
+    found = ssim_map(x, y)[:, 5:-5]
+    assert abs(tilt) < 1e-3
+    np.testing.assert_allclose(found, contrast, rtol=1e-4)
+
+
+def test_ssim_takes_both_pictures_alike_and_stays_within_its_bounds() -> None:
+    test, truth = noise(1), 1.0 - noise(1)
+    np.testing.assert_allclose(ssim_map(test, truth), ssim_map(truth, test), atol=1e-12)
+    assert -1.0 <= ssim_map(test, truth).min() < 0.0  # a negative: the structure is turned over
+
+
+def test_the_mask_says_where_ssim_is_averaged() -> None:
+    test, mask = noise(), np.zeros((24, 32), np.bool_)
+    test[:, 16:] = 0.0
+    mask[:, :10] = True  # further from what was changed than half a window
+    assert ssim(test, noise(), mask) == pytest.approx(1.0, abs=1e-9)
+    assert ssim(test, noise(), ~mask) < 0.9
 
 
 def test_flip_without_its_library_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,7 +35,11 @@ _ELSEWHERE = (
     "python docs/",
     "python -m schemas.generate",
 )
-_SMALL = {"render": ["--image-width", "32", "--samples", "1"], "bake probes": ["--samples", "1"]}
+_SMALL = {
+    "render": ["--image-width", "32", "--samples", "1"],
+    "bake probes": ["--samples", "1"],
+    "compare stage.usda": ["--image-width", "32", "--samples", "1", "--reference-samples", "1"],
+}
 
 
 class Block(NamedTuple):

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from ..progress import Report
     from ..verbs.compare_report import Account
 
+SAMPLES = 64
+"""Of the reference, where nobody says."""
 STAGES = (".usd", ".usda", ".usdc", ".usdz")
 
 First = Annotated[
@@ -38,7 +40,7 @@ Second = Annotated[
     typer.Argument(metavar="OUTDIR|B", help="The folder to write, or with a picture the one to compare it with."),
 ]
 Third = Annotated[
-    str, typer.Argument(metavar="[OUTDIR]", help="With two pictures, the folder to write. Without it nothing is.")
+    str, typer.Argument(metavar="OUTDIR", help="With two pictures, the folder to write. Without it nothing is.")
 ]
 Frame = Annotated[float | None, typer.Option(help="Time code to draw. Without it the stage's start.")]
 ReferenceSamples = Annotated[int, typer.Option(help="Samples per pixel of the reference, 1 to 4096.")]
@@ -73,7 +75,7 @@ def compare_command(
     image_width: ImageWidth = None,
     image_height: ImageHeight = None,
     samples: Samples = None,
-    reference_samples: ReferenceSamples = 64,
+    reference_samples: ReferenceSamples = SAMPLES,
     tiers: Tiers = None,
     screen: Screen = None,
     model: ModelName = None,
@@ -121,8 +123,13 @@ def compare_command(
             account = _of_stage(first, second, {**how, **draws, "overrides": given}, report, cancel)
             out = second
         else:
-            flags = {"--suggest": suggest, "--write": write, "--frame": frame is not None}
-            _refuse(first, [*(f"--{name.replace('_', '-')}" for name in given), *(f for f in flags if flags[f])])
+            flags = {
+                "--suggest": suggest, "--write": write, "--frame": frame is not None,
+                "--reference-samples": reference_samples != SAMPLES, "--disable-camera-light": disable_camera_light,
+                "--render-settings-prim-path": render_settings_prim_path,
+            }  # fmt: skip
+            named = [f"--{name.replace('_', '-')}" for name in given if name not in ("camera_light", "jobs")]
+            _refuse(first, [*named, *(flag for flag, is_given in flags.items() if is_given)])
             account = _of_pictures(first, second, third, how)
             out = third
         typer.echo(to_json(account) if as_json else to_text(account, out))

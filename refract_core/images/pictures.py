@@ -75,10 +75,12 @@ def read_planes(path: str) -> dict[str, F32]:
         AOV name -> float32, shapes as `aovs.shape_of`; `beauty` is there always, scene-linear with premultiplied alpha.
 
     Raises:
+        UsageError: the extension is unknown.
         ImageError: unreadable, damaged, too large, or an .exr without R, G and B.
     """
+    extension = _extension(path)
     with named_file(path, path) as file:
-        if _extension(path) not in LAYERED:
+        if extension not in LAYERED:
             rgba, _, integer, straight = read_pixels(file, path)
             return {"beauty": _linear_premultiplied(rgba, integer, straight)}
         pixels, spec = read_channels(file, path)

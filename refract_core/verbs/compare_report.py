@@ -100,11 +100,11 @@ def check_folder(out: str, *, overwrite: bool) -> None:
         UsageError: it is a file, or has something else in it.
         ImageError: it cannot be made, or nothing can be written to it.
     """
-    path = os.path.abspath(out)
-    check_place(f"{path}.part", ImageError)
+    path = out.rstrip("/") or out
     if not os.path.isdir(path):
         if os.path.lexists(path):
             raise UsageError(f"{out}: is a file; name a folder for the report")
+        check_place(path, ImageError)
         return
     check_place(os.path.join(path, FILES[0]), ImageError)
     if os.listdir(path) and not (overwrite or _is_report(path)):

@@ -81,8 +81,9 @@ def suggest(stage: str, write: str, drawn: Drawn, read: Read, cancel: Callable[[
     """
     scene, notices = drawn.scene, []
     names = list(dict.fromkeys(owner.material for owner in drawn.owners.every))
-    glass = _glass_by_name(stage, names)
-    measured, left = _measured(stage, glass, drawn, read, cancel)
+    glass = glass_by_name(stage, names)
+    prims = [owner.path for owner in drawn.owners.every]
+    measured, left = measured_scene(stage, glass, prims, read, cancel)
     found: list[Trials] = []
     winners: dict[str, tuple[Candidate, Scene]] = {}
     for name in names:
@@ -92,7 +93,7 @@ def suggest(stage: str, write: str, drawn: Drawn, read: Read, cancel: Callable[[
             continue
         tried: list[Trial] = []
         scenes: list[tuple[Candidate, Scene]] = []
-        for candidate in _candidates(scene, name, measured):
+        for candidate in candidates(scene, name, measured):
             stop_if(cancel, _STATE)
             changed = scene if candidate.now else applied(scene, name, candidate, measured)
             what = f"{name} as {candidate.model.token} {candidate.thickness}".strip()
@@ -104,7 +105,7 @@ def suggest(stage: str, write: str, drawn: Drawn, read: Read, cancel: Callable[[
         winners[name] = scenes[tried.index(trials.best)]
     if not write:
         return Suggestion(tuple(found), None, tuple(notices), None)
-    layer, changed_names, lost = _authored(stage, scene, glass, winners)
+    layer, changed_names, lost = authored(stage, scene, glass, winners)
     frame = drawn.draw(read(stage_of(layer)), "as suggested")
     score = drawn.against(frame).score(_counted(drawn))
     assert score is not None
@@ -114,21 +115,21 @@ def suggest(stage: str, write: str, drawn: Drawn, read: Read, cancel: Callable[[
 # --- what there is --------------------------------------------------------------------------------------------------
 
 
-def _glass_by_name(stage: str, names: list[str]) -> dict[str, Glass]:
+def glass_by_name(stage: str, names: list[str]) -> dict[str, Glass]:
     """What a layer can say about the scene's glass, by the name of the material."""
     work = begin(stage, flatten=False)
     every = {glass.path: glass for glass in find_glass(work.stage, work.time, work.unit)}
     return {name: every[name] for name in names if name in every}
 
 
-def _measured(
-    stage: str, glass: dict[str, Glass], drawn: Drawn, read: Read, cancel: Callable[[], bool]
+def measured_scene(
+    stage: str, glass: dict[str, Glass], prims: list[str], read: Read, cancel: Callable[[], bool] = lambda: False
 ) -> tuple[Scene, dict[str, str]]:
     """The scene with every thickness measured that can be, and by path of a prim why one could not."""
     layer = overlay(stage, made=MADE)
     sized = next(model.token for model in Model if model.sized)  # of a model that fixes it none would be measured
     add(layer, [Addition(one.edit, True, {"refraction:model": sized}, {}) for one in glass.values() if one.edit])
-    left = bake_over(layer, [owner.path for owner in drawn.owners.every], cancel=cancel)
+    left = bake_over(layer, prims, cancel=cancel)
     return read(stage_of(layer)), {notice.path: notice.text for notice in left}
 
 
@@ -163,7 +164,7 @@ def _notes(name: str, places: dict[str, Mask], left: dict[str, str]) -> Iterator
 # --- what is tried --------------------------------------------------------------------------------------------------
 
 
-def _candidates(scene: Scene, name: str, measured: Scene) -> Iterator[Candidate]:
+def candidates(scene: Scene, name: str, measured: Scene) -> Iterator[Candidate]:
     """Every model with every thickness that there is for it; what the stage has comes first."""
     now = next(material.model for material in scene.materials if material.name == name and material.refractive)
     things = list(_things(scene, name))
@@ -276,7 +277,7 @@ def _counted(drawn: Drawn) -> Mask:
 # --- what is written ------------------------------------------------------------------------------------------------
 
 
-def _authored(
+def authored(
     stage: str, scene: Scene, glass: dict[str, Glass], winners: dict[str, tuple[Candidate, Scene]]
 ) -> tuple[Any, tuple[str, ...], list[Notice]]:
     """A layer over the stage with the winners in it, the materials it changes, and what could not be written."""
