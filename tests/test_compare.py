@@ -87,8 +87,9 @@ def test_ssim_of_even_pictures_is_what_is_left_of_their_means(a: float, b: float
 
 
 def test_ssim_of_a_fainter_pattern_is_what_is_left_of_its_contrast() -> None:
-    """For y = m + k (x - m) the second factor is (2 k v + C2) / ((1 + k^2) v + C2), v the window's variance, C2 = 0.03^2
-    (Wang et al. 2004, equation 13). With stripes of one pixel v is the same in every window, and so is the mean."""
+    """For y = m + k (x - m) the second factor is (2 k v + C2) / ((1 + k^2) v + C2), v the window's variance and C2 =
+    0.03^2 (Wang et al. 2004, equation 13). Stripes of one pixel have the same v and m in every window.
+    """
     signs = np.where(np.arange(32) % 2 == 0, 1.0, -1.0)
     at = np.arange(-5, 6)
     weights = np.exp(-0.5 * (at / 1.5) ** 2)

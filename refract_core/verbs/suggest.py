@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..models import Model
+from ..models import SHEET, Model
 from ..scene import Material, Mesh, Notice, Param, Scene, Source, Sphere
 from ..thickness.fit import alike, fit
 from ..usd.convert.author import Addition, add, begin
@@ -100,7 +100,7 @@ def suggest(stage: str, write: str, drawn: Drawn, read: Read, cancel: Callable[[
             frame = drawn.frame if candidate.now else drawn.draw(changed, what)
             tried.append(_judged(candidate, frame, drawn, places, scene.metres_per_unit))
             scenes.append((candidate, changed))
-        trials = Trials(name, tuple(tried), tuple(_notes(name, places, left)))
+        trials = Trials(name, tuple(tried), tuple(_notes(scene, name, places, left)))
         found.append(trials)
         winners[name] = scenes[tried.index(trials.best)]
     if not write:
@@ -153,9 +153,18 @@ def _places(drawn: Drawn, name: str) -> dict[str, Mask]:
     return found
 
 
-def _notes(name: str, places: dict[str, Mask], left: dict[str, str]) -> Iterator[str]:
+def _notes(scene: Scene, name: str, places: dict[str, Mask], left: dict[str, str]) -> Iterator[str]:
     if len(places) > 1:
         yield f"{len(places)} prims share it, so it gets one model, by all of their pixels together"
+    seen = [thing for thing in _things(scene, name) if thing.path in places]
+    models = {material.model for material in scene.materials if material.name == name}
+    solid = [thing.path for thing in seen if isinstance(thing, Sphere) or thing.closed]
+    if solid and SHEET in models:
+        kept = f"keep '{SHEET.token}' if a shell is meant"
+        yield f"{solid[0]} is closed, so the reference takes it for solid glass; {kept}"
+    if len(solid) < len(seen) and any(model.sized for model in models):
+        opened = next(thing.path for thing in seen if thing.path not in solid)
+        yield f"{opened} is open, so the reference knows no thickness of it, and draws it as '{SHEET.token}'"
     for path in places:
         if path in left:
             yield f"{path}: thickness not measured, {left[path].removeprefix('left alone: ')}"
@@ -176,8 +185,10 @@ def candidates(scene: Scene, name: str, measured: Scene) -> Iterator[Candidate]:
     for model in Model:
         if model is Model.NONE:
             continue
-        thickness = typed if model.sized else ""
-        found.append(Candidate(model, thickness, value if model.sized else None, model is now))
+        if not model.sized:
+            found.append(Candidate(model, "", None, model is now))
+        elif own or value is not None:
+            found.append(Candidate(model, typed, value, model is now))
         if model.sized and has_measured:
             found.append(Candidate(model, "measured", None, False))
     yield from sorted(found, key=lambda one: not one.now)
@@ -190,15 +201,16 @@ def _differs(before: Mesh | Sphere, after: Mesh | Sphere) -> bool:
     return values is not None and not (known is not None and np.array_equal(values, known))
 
 
-def _fitted(things: list[Mesh | Sphere]) -> float:
-    """One thickness [m] for all: a ball's diameter or a box's smallest side, as `refract convert` has it."""
+def _fitted(things: list[Mesh | Sphere]) -> float | None:
+    """One thickness [m] for all: a ball's diameter or a box's smallest side, as `refract convert` has it; None where
+    all is flat."""
     every = [
         2.0 * one.radius if isinstance(one, Sphere) else fit(one.points.astype(np.float64), one.triangles).thickness
         for one in things
     ]
     known = [thickness for thickness in every if thickness > 0.0]
     if not known:
-        return 1e-3
+        return None
     return known[0] if alike(known) else float(np.median(known))
 
 
