@@ -26,7 +26,7 @@ from refract_core.scene import Mesh, Model, Param, Scene, Sphere
 from refract_core.usd.stage import load_stage, scene_from_stage
 from refract_core.usd.thickness.find import stage_of
 from refract_core.verbs import compare_numbers, compare_renders, suggest
-from refract_core.verbs.compare_numbers import Contrast, correlation
+from refract_core.verbs.compare_numbers import Contrast, Trial, Trials, correlation
 from refract_core.verbs.compare_report import FILES, FORMAT, heat
 from refract_core.verbs.owners import NOBODY, Owner, find_owners
 
@@ -524,3 +524,11 @@ def _same_glass(written: Scene, drawn: Scene, name: str, thickness: str) -> None
 
 def test_png_bytes_are_a_png() -> None:
     assert png_bytes(np.zeros((2, 3, 3), np.uint8)).startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("psnrs", "best"), [((30.0, 30.05), 0), ((30.0, 30.2, 31.0), 2), ((30.0, 29.0), 0), ((np.inf, np.inf), 0)]
+)
+def test_what_the_stage_has_stays_where_nothing_is_clearly_better(psnrs: tuple[float, ...], best: int) -> None:
+    trials = tuple(Trial("traced", "", None, psnr, {}, number == 0) for number, psnr in enumerate(psnrs))
+    assert Trials("/glass", trials, ()).best is trials[best]

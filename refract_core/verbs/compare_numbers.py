@@ -24,6 +24,8 @@ Mask = NDArray[np.bool_]
 
 COVERED = 0.5
 """`mask` from which a pixel counts as glass; a tier's weight over which its pixel counts as that tier's."""
+BETTER = 0.1
+"""[dB] by which another model must come nearer before a stage is worth changing."""
 WEIGHTS = tuple(f"weight.{tier}" for tier in (*TIERS, "none"))
 
 
@@ -114,8 +116,9 @@ class Trials:
 
     @property
     def best(self) -> Trial:
-        """The one nearest to the reference; what the stage has where nothing is better by a hundredth of a dB."""
-        return max(self.trials, key=lambda trial: (round(trial.psnr, 2), trial.now))
+        """The one nearest to the reference; what the stage has where nothing is better by `BETTER`."""
+        found = max(self.trials, key=lambda trial: trial.psnr)
+        return found if found.psnr >= self.now.psnr + BETTER else self.now
 
     @property
     def now(self) -> Trial:

@@ -315,11 +315,12 @@ def _suggestions(account: Account) -> Table:
     else:
         below.insert(0, "There is no glass to try anything on.")
     if account.written is not None:
-        changed = ", ".join(account.written.changed) or "nothing, as the stage has the best already"
-        below.append(
-            f"{account.written.file}: written, it changes {changed}. With it the glass has "
-            f"{_db(account.written.score.psnr)} dB, before {_db(account.findings.counted.psnr)}."
-        )
+        changed = ", ".join(account.written.changed)
+        text = f"it changes {changed}" if changed else "it changes nothing, as there is nothing better"
+        scores = account.written.score, account.findings.counted
+        now, before = (f"{score.psnr:.2f} dB" if math.isfinite(score.psnr) else "no error" for score in scores)
+        where = "the glass" if account.findings.glass else "the picture"
+        below.append(f"{account.written.file}: written, {text}. With it {where} has {now}, before {before}.")
     return Table("Suggestions", ("prim", *labels, "best"), rows, tuple(below))
 
 

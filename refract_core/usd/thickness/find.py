@@ -14,6 +14,7 @@ from ...scene import F64, U32, Material, Model, Notice, Param, Texture
 from ...settings import PURPOSES
 from ...thickness.solid import signed_volume
 from ..convert.find import editable, find_glass, original
+from ..diagnostics import captured
 from ..geometry.parts import Bound, bind
 from ..geometry.place import uniform_scale
 from ..geometry.primvars import Corners, Topology, read_primvar, spread
@@ -144,7 +145,8 @@ def find_candidates(stage: Usd.Stage) -> Found:
 
 def stage_of(layer: Sdf.Layer) -> Usd.Stage:
     """The stage whose root a layer is; a door for those who know no USD."""
-    return recognised(Usd.Stage.Open(layer))
+    with captured():  # whoever opened the stage below has been told
+        return recognised(Usd.Stage.Open(layer))
 
 
 def _merged(group: list[Candidate]) -> Candidate:
