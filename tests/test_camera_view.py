@@ -12,7 +12,7 @@ from scenes import camera, view_rays
 from refract_core.errors import UsageError
 from refract_core.kernels.compile import kernel
 from refract_core.kernels.lanes import by_address
-from refract_core.kernels.sampling import pixel_offset
+from refract_core.kernels.sampling import pixel_offsets
 from refract_core.scene import Camera
 from refract_core.view.camera import View, image_size, pixel_point, pixel_ray, project, view_of
 
@@ -95,15 +95,18 @@ def test_height_follows_the_aspect() -> None:
     assert image_size(PERSPECTIVE, 100, 7) == (100, 7)
 
 
-def test_sample_zero_stands_at_the_centre_and_the_rest_fill_the_pixel() -> None:
-    assert pixel_offset(0) == (0.0, 0.0)
-    offsets = np.array([pixel_offset(i) for i in range(64)])
-    assert (offsets >= -0.5).all()
-    assert (offsets < 0.5).all()
-    assert np.abs(offsets.mean(0)).max() < 0.05
-    # Each quarter of the pixel gets its share of 64 samples, 16, give or take 2 (low discrepancy).
-    quarter = 2 * (offsets[:, 0] < 0) + (offsets[:, 1] < 0)
-    assert np.abs(np.bincount(quarter, minlength=4) - 16).max() <= 2
+@pytest.mark.parametrize("samples", [1, 2, 4, 5, 9, 16, 64, 100])
+def test_samples_fill_the_pixel_evenly_about_its_centre(samples: int) -> None:
+    offsets = np.array(pixel_offsets(samples))
+    assert np.abs(offsets).max() < 0.5
+    np.testing.assert_allclose(offsets.mean(0), 0.0, atol=1e-12)
+    for axis in range(2):  # a Latin square: one in each row and in each column
+        np.testing.assert_array_equal(np.sort(np.floor((offsets[:, axis] + 0.5) * samples)), np.arange(samples))
+    from_centre = np.linalg.norm(offsets, axis=1)
+    assert from_centre[0] == from_centre.min()
+    if samples in (4, 16, 64):  # a net: as many in every quarter
+        quarter = 2 * (offsets[:, 0] < 0) + (offsets[:, 1] < 0)
+        assert (np.bincount(quarter, minlength=4) == samples // 4).all()
 
 
 @CAMERAS

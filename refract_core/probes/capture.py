@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..kernels.arrays import F64_1D, F64_2D
 from ..kernels.compile import inlined, kernel
 from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Scalars, by_address, scratch
-from ..kernels.sampling import Key, pixel_offset, set_key
+from ..kernels.sampling import Key, pixel_offsets, set_key
 from ..kernels.vec import along, length, normalize, row, scale, transform_direction, transform_point
 from ..scene import Cubemap
 from ..world.embree import COHERENT, Packet, clear, set_ray
@@ -174,8 +174,7 @@ def fill_table(table: ProbeTable, entries: list[Entry], world: World, run: Run, 
         Rays traced.
     """
     probes = by_address(table)
-    jitter = np.array([pixel_offset(i) for i in range(samples)], np.float64)
-    jitter -= jitter.mean(0)  # few samples lean to one side, and the whole picture would stand askew
+    jitter = np.array(pixel_offsets(samples), np.float64)
     tasks: list[tuple[Shot, int, int, int]] = []
     for k, entry in enumerate(entries):
         if not entry.drawn:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..images.frame import Frame
 from ..kernels.compile import is_compiled
 from ..kernels.lanes import by_address
-from ..kernels.sampling import pixel_offset
+from ..kernels.sampling import pixel_offsets
 from ..models import BY_TOKEN, SHEET, Behind
 from ..progress import COMPILING
 from ..scene import Camera, Notice, Scene
@@ -107,12 +107,13 @@ def _draw(
     planes = new_planes(*size)
     integrator = Tree(session, scene, camera, settings, tiles, planes)
     rays = 0
+    offsets = pixel_offsets(settings.samples)
     for sample in range(settings.samples):
         work.progress(0.2 + 0.8 * sample / settings.samples, "image")
-        view = view_of(camera, *size, pixel_offset(sample))
+        view = view_of(camera, *size, offsets[sample], settings.samples)
         for step in integrator.passes(view, sample):
             rays += sum(work.run(step.draw, step.items))
     finish = by_address(finish_of(scene, settings.samples, camera.exposure_scale * 2.0**settings.exposure))
-    centred, target = by_address(view_of(camera, *size)), by_address(planes)
-    work.run(lambda tile: finish_tile(target, centred, finish, tile), tiles)
+    first, target = by_address(view_of(camera, *size, offsets[0])), by_address(planes)
+    work.run(lambda tile: finish_tile(target, first, finish, tile), tiles)
     return by_name(planes), rays

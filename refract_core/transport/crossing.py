@@ -117,6 +117,8 @@ class Meeting(NamedTuple):
     """where a model leaves [m]"""
     length: Vectors
     """way inside a model, per channel [m]"""
+    t: Scalars
+    """along the ray that met it [m]"""
 
 
 @inlined
@@ -150,7 +152,7 @@ def meet(meeting: Meeting, lane: int, now: Rays, at: Interaction, world: World, 
         absorb(now, lane, hit.t)
         slot = media.depth[lane] - 1
         kind = LEFT
-    meeting.slot[lane] = slot
+    meeting.slot[lane], meeting.t[lane] = slot, hit.t
     if kind == PASSED:
         meeting.kind[lane] = kind
         return
@@ -340,6 +342,7 @@ def _follow(to: Rays, i: int, now: Rays, lane: int, meeting: Meeting, step: int)
     to.inner[i] = 0
     to.met[i] = now.met[lane] + 1
     to.lost[i] = 1 if to.met[i] >= MOST_MET else 0
+    to.travelled[i] += meeting.t[lane]
     to.branch[i] = 4 * now.branch[lane] + step
     to.roughness[i] = max(now.roughness[lane], meeting.roughness[lane])
     if meeting.kind[lane] != LEFT:
@@ -416,6 +419,7 @@ def _send_answered(to: Rays, i: int, meeting: Meeting, lane: int, c: int, rules:
         left = transmittance(row(meeting.color, lane), meeting.distance[lane], length)
         put(to.weight, i, mul(row(to.weight, i), left))
         to.path[i] += length
+        to.travelled[i] += length
         return
     p = row(meeting.point, lane)
     inside = normalize(sub(leave, p))
@@ -451,5 +455,6 @@ def send_out(to: Rays, i: int, now: Rays, lane: int) -> int:
     to.start[i] = to.begun[i] = 0.0
     to.end[i] = math.inf
     to.inner[i] = 0
+    to.travelled[i] += now.end[lane]
     drop_medium(to.media, i, slot_of(now.media, lane, now.thing[lane]))
     return i + 1

@@ -70,6 +70,8 @@ class Rays(NamedTuple):
     """perceptual, the largest on its way"""
     path: F64_1D
     """its way inside media so far [m]"""
+    travelled: F64_1D
+    """its way from the eye to its origin [m]; what it sees of a texture is as wide as its cone is by then"""
     inner: I32_1D
     """1 on the inner stretch of a model, from its entry to its exit"""
     leave_point: F64_2D
@@ -109,10 +111,10 @@ def new_rays(count: int) -> Rays:
         numbers(MOST_MEDIA, 3), numbers(MOST_MEDIA),
     )  # fmt: skip
     vectors = ("origin", "direction", "weight", "clear", "normal", "leave_point", "leave_direction")
-    lengths = ("start", "begun", "end", "blur", "roughness", "path")
+    lengths = ("start", "begun", "end", "blur", "roughness", "path", "travelled")
     fields = {name: numbers(3) for name in vectors} | {name: numbers() for name in lengths}
     made: list[Any] = [fields[name] if name in fields else words() for name in Rays._fields[:-1]]
-    return Rays(*made, media)
+    return Rays._make([*made, media])
 
 
 @inlined
@@ -128,6 +130,7 @@ def copy_ray(to: Rays, i: int, rays: Rays, j: int) -> None:
         to.leave_direction[i, c] = rays.leave_direction[j, c]
     to.start[i], to.begun[i], to.end[i] = rays.start[j], rays.begun[j], rays.end[j]
     to.blur[i], to.roughness[i], to.path[i] = rays.blur[j], rays.roughness[j], rays.path[j]
+    to.travelled[i] = rays.travelled[j]
     to.inner[i], to.pixel[i], to.branch[i] = rays.inner[j], rays.pixel[j], rays.branch[j]
     to.channel[i], to.side[i], to.thing[i] = rays.channel[j], rays.side[j], rays.thing[j]
     to.entered[i], to.met[i], to.lost[i] = rays.entered[j], rays.met[j], rays.lost[j]

@@ -68,6 +68,8 @@ class Query(NamedTuple):
     """1: the ray is inside a medium, and meets an opaque object there"""
     by_proxy: Flags
     """1: it asks the screen by HDRP's proxy, and maps roughness as HDRP does"""
+    width: Scalars
+    """of the ray's cone where it meets that [m]"""
     met: HitLanes
     """the opaque surface that it meets; `NOTHING` where it meets none"""
     color: Vectors
@@ -257,7 +259,8 @@ def _ask_rays(query: Query, embedded: bool, work: TierScratch, world: World, sam
     for lane in range(LANES):
         if work.sent[lane] == 2:
             d = row(query.direction, lane)
-            at = interaction(world.geometry, kept_hit(query.met, lane), Ray(row(query.origin, lane), d), 0.0)
+            ray = Ray(row(query.origin, lane), d)
+            at = interaction(world.geometry, kept_hit(query.met, lane), ray, query.width[lane])
             second.on[lane] = 1
             load_surface(second, lane, at, world, scale(d, -1.0))
     shade(second, work.third, packet, world, sample, OPAQUE)

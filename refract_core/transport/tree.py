@@ -20,7 +20,7 @@ from ..kernels.sampling import Key, set_key
 from ..kernels.vec import along, dot, row, scale
 from ..scene import Model
 from ..view.camera import Tile, View, pixel_ray
-from ..view.gbuffer import OpaqueLayer, pixel_spread
+from ..view.gbuffer import OpaqueLayer
 from ..view.planes import Planes
 from ..world.embree import COHERENT, EVERYTHING, OPAQUE, SCATTERED, Packet, clear, has_hit, set_ray
 from ..world.offsets import tie
@@ -274,9 +274,10 @@ def _trace(scratch: TreeScratch, world: World, rules: Rules, taken: int) -> None
         # far side of the table: from inside, an opaque surface within rounding of the glass takes it. "Inside" is in a
         # medium, or behind a model's exit, before the wall of the real body.
         p, d = row(now.origin, lane), row(now.direction, lane)
-        if now.media.depth[lane] == 0:
-            if now.entered[lane] == 0 or dot(interaction(world.geometry, hit, Ray(p, d), 0.0).ng, d) <= 0.0:
-                continue
+        if now.media.depth[lane] == 0 and (
+            now.entered[lane] == 0 or dot(interaction(world.geometry, hit, Ray(p, d), 0.0).ng, d) <= 0.0
+        ):
+            continue
         near = tie(along(p, d, hit.t))
         scratch.far[lane] = hit.t + near
         set_ray(packet, lane, p, d, max(0.0, hit.t - near), hit.t + near, OPAQUE)
@@ -312,7 +313,7 @@ def _meet_all(scratch: TreeScratch, world: World, asking: Asking, rules: Rules, 
         first = now.side[lane] == VIEW
         direction = row(now.direction, lane)
         at = interaction(
-            world.geometry, hit, Ray(row(now.origin, lane), direction), pixel_spread(view) if first else 0.0
+            world.geometry, hit, Ray(row(now.origin, lane), direction), view.spread * (now.travelled[lane] + hit.t)
         )
         meet(meeting, lane, now, at, world, rules)
         scratch.state[lane] = _MET
@@ -417,6 +418,7 @@ def _load_query(scratch: TreeScratch, asking: Asking, x0: int, y0: int, k: int, 
     query.blur[lane] = leaves.blur[k]
     query.roughness[lane] = leaves.roughness[k]
     query.thing[lane] = leaves.thing[k]
+    query.width[lane] = asking.screen.camera.spread * (leaves.travelled[k] + scratch.leaf_hits.t[k])
     keep_hit(query.met, lane, kept_hit(scratch.leaf_hits, k))
     inside = leaves.media.depth[k] > 0 and scratch.leaf_hits.part[k] != NOTHING
     query.embedded[lane] = 1 if inside else 0

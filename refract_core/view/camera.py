@@ -6,6 +6,7 @@ of a window that already holds the sub-pixel jitter. `z_depth` is along the came
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +33,8 @@ class View(NamedTuple):
     clipping: F64_1D
     """shape (2,): near, far z_depth [m]"""
     orthographic: bool
+    spread: float
+    """growth of a sample's cone per metre along its ray; its width at the eye is left out"""
 
 
 class PixelPoint(NamedTuple):
@@ -53,8 +56,13 @@ def image_size(camera: Camera, width: int, height: int) -> tuple[int, int]:
     return width, height
 
 
-def view_of(camera: Camera, width: int, height: int, jitter: tuple[float, float] = (0.0, 0.0)) -> View:
+def view_of(
+    camera: Camera, width: int, height: int, jitter: tuple[float, float] = (0.0, 0.0), samples: int = 1
+) -> View:
     """Conform `camera` to an image of square pixels by expanding its window, and shift it by `jitter` pixels.
+
+    Args:
+        samples: that share a pixel; each has that part of it for its own.
 
     Raises:
         UsageError: the camera has no field of view.
@@ -71,7 +79,9 @@ def view_of(camera: Camera, width: int, height: int, jitter: tuple[float, float]
     m = camera.world_from_camera
     axes = np.stack([m[:3, 0], m[:3, 1], -m[:3, 2], m[:3, 3]]).astype(np.float64)
     window = np.array([cx - w / 2 + dx, cx + w / 2 + dx, cy - h / 2 + dy, cy + h / 2 + dy])
-    return View(axes, window, np.array([width, height]), np.array(camera.clipping, np.float64), camera.orthographic)
+    size, clipping = np.array([width, height]), np.array(camera.clipping, np.float64)
+    spread = 0.0 if camera.orthographic else w / width / math.sqrt(samples)
+    return View(axes, window, size, clipping, camera.orthographic, spread)
 
 
 @inlined

@@ -67,12 +67,6 @@ def add_view_ray(packet: Packet, view: View, lane: int, x: int, y: int, mask: in
     return stop
 
 
-@inlined
-def pixel_spread(view: View) -> float:
-    """Growth of a pixel's cone per metre along its ray; its width at the eye is left out."""
-    return 0.0 if view.orthographic else (view.window[1] - view.window[0]) / view.size[0]
-
-
 @kernel
 def opaque_tile(
     world: World,
@@ -108,7 +102,7 @@ def opaque_tile(
                     glass += 1
             if behind:
                 _trace_behind_glass(scratch, world, view, x0, y0)
-            load_hits(block, packet, world, pixel_spread(view))
+            load_hits(block, packet, world, view.spread)
             shade(block, scratch.second, packet, world, sample, OPAQUE)
             _write_opaque(layer, block, world, view, x0, y0)
     return packet.tally[0], glass

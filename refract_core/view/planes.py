@@ -110,7 +110,7 @@ def by_name(planes: Planes) -> dict[str, F32]:
 
 @kernel
 def finish_tile(planes: Planes, view: View, finish: Finish, tile: Tile) -> None:
-    """Sums to values over a tile, in place. `view`: without jitter."""
+    """Sums to values over a tile, in place. `view`: that of sample 0, whose data the planes hold."""
     for y in range(tile[1], min(tile[3], view.size[1])):
         for x in range(tile[0], min(tile[2], view.size[0])):
             for c in range(3):

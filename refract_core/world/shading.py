@@ -98,14 +98,19 @@ class Block(NamedTuple):
 
 @inlined
 def load_hits(block: Block, packet: Packet, world: World, spread: float) -> None:
-    """Look at every hit of a traced packet and note its surface in the block. `spread`: see `surface.interaction`."""
+    """Look at every hit of a traced packet and note its surface in the block.
+
+    Args:
+        spread: growth of the rays' cones per metre.
+    """
     for lane in range(LANES):
         block.on[lane] = 0
         block.distance[lane] = math.inf
         if not has_hit(packet, lane):
             continue
         ray = ray_of(packet, lane)
-        at = interaction(world.geometry, hit_in(packet, lane, world.geometry), ray, spread)
+        hit = hit_in(packet, lane, world.geometry)
+        at = interaction(world.geometry, hit, ray, spread * hit.t)
         block.on[lane] = 1
         block.distance[lane] = at.hit.t
         load_surface(block, lane, at, world, scale(ray.direction, -1.0))

@@ -117,8 +117,8 @@ def _corners(geometry: Geometry, part: int, primitive: int) -> tuple[Vec, Vec, V
 
 
 @inlined
-def interaction(geometry: Geometry, hit: Hit, ray: Ray, spread: float) -> Interaction:
-    """Point and normals of a hit. `spread`: growth of the ray's cone per metre, for texture filtering.
+def interaction(geometry: Geometry, hit: Hit, ray: Ray, footprint: float) -> Interaction:
+    """Point and normals of a hit. `footprint`: width of the ray's cone there [m], for texture filtering.
 
     The point of a triangle is taken from its corners, not from the ray: that is exact to the rounding of the corners,
     where origin plus distance is only as good as the distance.
@@ -153,7 +153,7 @@ def interaction(geometry: Geometry, hit: Hit, ray: Ray, spread: float) -> Intera
             if dot(ns, ns) == 0.0:
                 ns = ng
             ns = flip_towards(ns, ng)
-    return Interaction(hit, point, ng, ns, spread * hit.t)
+    return Interaction(hit, point, ng, ns, footprint)
 
 
 # --- primvars -----------------------------------------------------------------------------------------------------

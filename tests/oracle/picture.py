@@ -59,8 +59,9 @@ class Oracle:
         self.window = _conformed(self.camera.window, width, height)
         self.shader = Shader(scene, self.eye)
         across = (self.window[1] - self.window[0]) / width
-        self.spread = 0.0 if self.camera.orthographic else across
-        """how much wider a pixel's cone gets per metre"""
+        self.jitters = sampling.jitters(settings.samples)
+        self.spread = 0.0 if self.camera.orthographic else across / math.sqrt(settings.samples)
+        """how much wider a sample's cone gets per metre"""
         self.marches = "screen" in settings.tiers
         """What is mirrored is marched for, which is not known here: planes that hold reflections are left out."""
         self.around: Media = () if self.camera.orthographic else media_around(self.shader, self.eye, settings.model)
@@ -114,7 +115,7 @@ class Oracle:
             sums.keep("N", list(n))
 
     def _through(self, x: int, y: int, k: int, nudge: tuple[float, float] = (0.0, 0.0)) -> tuple[Sight, View]:
-        jx, jy = sampling.jitter(k)
+        jx, jy = self.jitters[k]
         px, py = x + 0.5 + jx, y + 0.5 + jy
         straight = self.ray(px, py)
         view = View((x, y, 0), k, ray_bits(straight.origin, straight.direction))
@@ -165,7 +166,7 @@ class Oracle:
         z = dot(v, self.forward)
         w = 1.0 if self.camera.orthographic else z
         left, right, bottom, top = self.window
-        jx, jy = sampling.jitter(k)
+        jx, jy = self.jitters[k]
         px = (dot(v, self.right) / w - left) / (right - left) * self.size[0]
         py = (top - dot(v, self.up) / w) / (top - bottom) * self.size[1]
         return px - jx, py - jy, z
@@ -221,7 +222,8 @@ class Oracle:
         z = sums.of("Z", 1)[0]
         if z == math.inf:
             return sums.of("N", 3), [0.0] * 3
-        ray = self.ray(x + 0.5, y + 0.5)
+        jx, jy = self.jitters[0]
+        ray = self.ray(x + 0.5 + jx, y + 0.5 + jy)
         p = at(ray.origin, ray.direction, z / ray.cosine)
         rows = [[float(v) for v in row] for row in self.scene.stage_from_engine[:3]]
         size = abs(_determinant(rows)) ** (1.0 / 3.0)

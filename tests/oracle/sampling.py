@@ -47,9 +47,13 @@ def pair(key: Key, sample: int, purpose: int) -> tuple[float, float]:
     return u % 1.0, v % 1.0
 
 
-def jitter(sample: int) -> tuple[float, float]:
-    """Offset of a sample in its pixel; sample 0 is the centre."""
-    return (0.5 + sample / _PLASTIC) % 1.0 - 0.5, (0.5 + sample / _PLASTIC**2) % 1.0 - 0.5
+def jitters(samples: int) -> list[tuple[float, float]]:
+    """Offsets of all samples in their pixel, the one nearest to its centre first: x evenly, y in the order of van der
+    Corput's numbers, as evenly."""
+    mirrored = [int(bin(i)[:1:-1], 2) / 2.0 ** (len(bin(i)) - 2) for i in range(samples)]
+    ranks = {value: k for k, value in enumerate(sorted(mirrored))}
+    points = [((i + 0.5) / samples - 0.5, (ranks[mirrored[i]] + 0.5) / samples - 0.5) for i in range(samples)]
+    return sorted(points, key=lambda p: (p[0] ** 2 + p[1] ** 2, p))
 
 
 def float_bits(x: float) -> int:

@@ -97,6 +97,8 @@ class Ray(NamedTuple):
     met: int = 0
     way: float = 0.0
     """inside media, so far [m]"""
+    travelled: float = 0.0
+    """from the eye to the origin [m]"""
     branch: int = 0
     inner: Inner | None = None
 
@@ -224,9 +226,7 @@ class Tree:
 
     def _candidates(self, ray: Ray, start: float, far: float, kinds: int) -> list[Hit]:
         hits = self.shader.world.candidates(ray.origin, ray.direction, start + NEAR, far, kinds)
-        if ray.side is not Side.VIEW:
-            return hits
-        return [hit._replace(width=self.spread * hit.t) for hit in hits]
+        return [hit._replace(width=self.spread * (ray.travelled + hit.t)) for hit in hits]
 
     def _present(self, ray: Ray, view: View) -> Callable[[Hit], bool]:
         bits = view.bits if ray.side is Side.VIEW else None
@@ -300,10 +300,10 @@ class Tree:
         rays = []
         for way, part in zip(ways, through, strict=True):
             if max(part.weight) > 0.0:
-                child = self._follower(ray, s, part, sampling.THROUGH)._replace(channel=way.channel)
+                child = self._follower(ray, hit.t, s, part, sampling.THROUGH)._replace(channel=way.channel)
                 rays.append(self._through(child, hit, s, choice, way))
         if max(back.weight) > 0.0:
-            child = self._follower(ray, s, back, sampling.GLANCED)
+            child = self._follower(ray, hit.t, s, back, sampling.GLANCED)
             blur = math.hypot(ray.blur, 2.0 * s.roughness**2)
             entered = ray.entered + (step is not Step.LEAVES)
             rays.append(child._replace(direction=optics.glanced(d, s.ns, s.ng), blur=blur, entered=entered))
@@ -323,8 +323,8 @@ class Tree:
     def _cut(
         self, back: _Part, through: list[_Part], ways: list[_Way], met: int
     ) -> tuple[_Part, list[_Part]]:
-        """What weighs too little goes the way of the rest, and what runs round for long is let out. Channels that are totally reflected have no way through:
-        they stay mirrored."""
+        """What weighs too little goes the way of the rest, and what runs round for long is let out. Channels that are
+        totally reflected have no way through: they stay mirrored."""
         r, t = max(back.weight), max(sum(part.weight[c] for part in through) for c in range(3))
         self._doubt(r, t)
         if t > 0.0 and (r < self.cut or met >= _LATE):
@@ -347,13 +347,13 @@ class Tree:
             self.shader.unsure = True
 
     @staticmethod
-    def _follower(ray: Ray, s: Surface, part: _Part, step: int) -> Ray:
+    def _follower(ray: Ray, t: float, s: Surface, part: _Part, step: int) -> Ray:
         """What both ways have in common; as it is, it goes back into the media it came from."""
         way = Side.THROUGH if step == sampling.THROUGH else Side.MIRRORED
         return ray._replace(
             origin=s.point, start=0.0, far=math.inf, weight=part.weight, clear=part.clear, inner=None,
             side=way if ray.side is Side.VIEW else ray.side, roughness=max(ray.roughness, s.roughness),
-            met=ray.met + 1, branch=sampling.branched(ray.branch, step),
+            met=ray.met + 1, branch=sampling.branched(ray.branch, step), travelled=ray.travelled + t,
         )  # fmt: skip
 
     def _through(self, child: Ray, hit: Hit, s: Surface, choice: Choice, way: _Way) -> Ray:
@@ -373,7 +373,7 @@ class Tree:
             left = absorbed(body.tint, body.distance, passage.path)
             return child._replace(
                 weight=mul(child.weight, left), way=child.way + passage.path, origin=passage.point,
-                direction=passage.direction,
+                direction=passage.direction, travelled=child.travelled + passage.path,
             )  # fmt: skip
         child = child._replace(media=choice.behind)
         if self.by_proxy or passage.path == 0.0:
@@ -447,8 +447,9 @@ def _out(ray: Ray, inner: Inner) -> Ray:
     media = tuple(m for m in ray.media if m is not inner.body)
     passage = inner.passage
     return ray._replace(
-        origin=passage.point, direction=passage.direction, start=0.0, far=math.inf, media=media, inner=None
-    )
+        origin=passage.point, direction=passage.direction, start=0.0, far=math.inf, media=media, inner=None,
+        travelled=ray.travelled + passage.path,
+    )  # fmt: skip
 
 
 def _passage(model: Model, s: Surface, ior: float, thickness: float) -> Passage:
