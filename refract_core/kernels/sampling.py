@@ -1,8 +1,8 @@
 """The one deterministic sequence behind every sample: a function of pixel, branch, sample number and purpose.
 
-Samples of one pixel follow the R2 sequence (M. Roberts, "The unreasonable effectiveness of quasirandom sequences",
-2018); pixels are decorrelated by a Cranley-Patterson rotation from an integer hash (PCG output permutation,
-O'Neill 2014). No state: tiles, threads and order cannot change a picture.
+Samples of one pixel follow the (0,2)-sequence of van der Corput and Sobol, its digits scrambled for each pixel (Kollig
+and Keller, "Efficient multidimensional sampling", Computer Graphics Forum 21(3), 2002) by an integer hash (PCG output
+permutation, O'Neill 2014). No state: tiles, threads and order cannot change a picture.
 
 Every decision has a dimension of its own: its `Purpose` within its branch. A branch is a ray that follows from another
 (what a mirror shows, what a ray tier meets), numbered by the way to it, so that the shadow of a light there has nothing
@@ -19,8 +19,6 @@ import numpy as np
 from .compile import inlined
 from .lanes import Words
 
-_A1 = 0.7548776662466927  # 1 / g, g = plastic number
-_A2 = 0.5698402909980532  # 1 / g^2
 _TO_UNIT = 1.0 / 4294967296.0
 
 
@@ -106,15 +104,24 @@ def chance_of_bits(a: int, b: int, c: int) -> float:
 
 @inlined
 def unit_pair(key: Key, sample: int, purpose: int) -> tuple[float, float]:
-    """Point `sample` of the key's rotated R2 sequence in [0, 1)^2, for one `Purpose`.
+    """Point `sample` of the key's own (0,2)-sequence in [0, 1)^2, for one `Purpose`.
 
-    Each dimension turns the sequence by an amount of its own: without that a pixel's light and its lobe would be drawn
-    at the same place of their squares, sample by sample, and their product would not average out.
+    Every run of 2^m samples that starts at a multiple of 2^m has one point in each box of area 2^-m of a dyadic grid,
+    whatever the box's shape. Each dimension is scrambled on its own: without that a pixel's light and its lobe would be
+    drawn at the same place of their squares, sample by sample, and their product would not average out.
     """
     dimension = _PURPOSES * key.branch + purpose
-    u = hash32(key.x, key.y, 2 * dimension) * _TO_UNIT + sample * _A1
-    v = hash32(key.x, key.y, 2 * dimension + 1) * _TO_UNIT + sample * _A2
-    return u - np.floor(u), v - np.floor(v)
+    u, v = hash32(key.x, key.y, 2 * dimension), hash32(key.x, key.y, 2 * dimension + 1)
+    i = np.uint32(sample)
+    mirrored, bent = np.uint32(1 << 31), np.uint32(1 << 31)
+    while i != np.uint32(0):
+        if i & np.uint32(1):
+            u ^= mirrored
+            v ^= bent
+        i >>= np.uint32(1)
+        mirrored >>= np.uint32(1)
+        bent ^= bent >> np.uint32(1)
+    return u * _TO_UNIT, v * _TO_UNIT
 
 
 def pixel_offsets(samples: int) -> list[tuple[float, float]]:

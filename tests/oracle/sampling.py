@@ -6,6 +6,7 @@ engine deals its dimensions anew.
 
 from __future__ import annotations
 
+import math
 import struct
 
 Key = tuple[int, int, int]
@@ -14,7 +15,6 @@ Key = tuple[int, int, int]
 SKY_FALLBACK, MIRROR, ROUGH_LEAF, SKY_PICK, SKY_CANDIDATE, FIRST_LIGHT = 1, 2, 3, 5, 6, 16
 SKY_CANDIDATES = 2
 
-_PLASTIC = 1.3247179572447460  # the real root of x^3 = x + 1; R2 steps by its inverse powers (Roberts 2018)
 _WORD = 0xFFFFFFFF
 
 
@@ -39,12 +39,16 @@ def hashed(x: int, y: int, z: int) -> int:
 
 
 def pair(key: Key, sample: int, purpose: int) -> tuple[float, float]:
-    """Point `sample` of a key's rotated R2 sequence."""
+    """Point `sample` of a key's scrambled (0,2)-sequence: digit k of the sample, times column k of the generator
+    matrices. The first is the identity, mirrored; the second is Pascal's triangle modulo 2 (Sobol 1967)."""
     x, y, branch = key
     dimension = 4096 * branch + purpose
-    u = hashed(x, y, 2 * dimension) / 2**32 + sample / _PLASTIC
-    v = hashed(x, y, 2 * dimension + 1) / 2**32 + sample / _PLASTIC**2
-    return u % 1.0, v % 1.0
+    u, v = hashed(x, y, 2 * dimension), hashed(x, y, 2 * dimension + 1)
+    for k in range(sample.bit_length()):
+        if sample >> k & 1:
+            u ^= 1 << (31 - k)
+            v ^= sum((math.comb(k, r) & 1) << (31 - r) for r in range(k + 1))
+    return u / 2**32, v / 2**32
 
 
 def jitters(samples: int) -> list[tuple[float, float]]:
