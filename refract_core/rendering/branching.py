@@ -44,6 +44,8 @@ class Tree:
             self.screen.color[: width * height].reshape(height, width, 4),
             self.screen.depth[: width * height].reshape(height, width),
             self.screen.normal,
+            self.screen.irradiance,
+            self.screen.gloss,
             np.zeros((height, width), np.uint8),
         )
 

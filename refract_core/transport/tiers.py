@@ -16,7 +16,7 @@ from ..kernels.arrays import I32_1D
 from ..kernels.compile import flag, inlined
 from ..kernels.lanes import LANES, Column, Flags, Scalars, Vectors, Words
 from ..kernels.sampling import Keys, Purpose, key_of, set_key, unit_pair
-from ..kernels.vec import Vec, add, frame, normalize, row, scale
+from ..kernels.vec import Vec, add, flip_towards, frame, mul, normalize, row, scale
 from ..optics.interface import screen_lod_hdrp
 from ..optics.lobes import Cone
 from ..probes.lookup import ProbeTable, influence, probe_light, proxy_distance
@@ -24,7 +24,7 @@ from ..probes.reach import next_of, piece_of
 from ..probes.volumes import update_headroom
 from ..view.camera import PixelPoint
 from ..view.pyramid import Screen
-from ..view.screen import screen_march, screen_proxy, screen_traced
+from ..view.screen import light_seen, screen_blurred, screen_march, screen_proxy
 from ..world.embree import OPAQUE, SCATTERED, Packet, clear, set_ray
 from ..world.environment import prefiltered
 from ..world.shading import Block, load_hits, load_surface, shade
@@ -66,6 +66,8 @@ class Query(NamedTuple):
     thing: Words
     embedded: Flags
     """1: the ray is inside a medium, and meets an opaque object there"""
+    strong: Flags
+    """1: much of its pixel's light comes this way, so that a ray of its own is worth its price"""
     by_proxy: Flags
     """1: it asks the screen by HDRP's proxy, and maps roughness as HDRP does"""
     width: Scalars
@@ -164,7 +166,7 @@ def ask(query: Query, asking: Asking, work: TierScratch, world: World, sample: i
             if query.on[lane] == 0 or _headroom(query, lane) <= 1.0 - _SPENT:
                 continue
             if tier == SCREEN:
-                _ask_screen(query, lane, asking, world)
+                _ask_screen(query, lane, asking, work, world)
             elif tier == PROBE:
                 _ask_probes(query, lane, asking, world, sky_follows)
             elif tier == SKY and world.environment.present:
@@ -176,7 +178,7 @@ def ask(query: Query, asking: Asking, work: TierScratch, world: World, sample: i
 
 
 @inlined
-def _ask_screen(query: Query, lane: int, asking: Asking, world: World) -> None:
+def _ask_screen(query: Query, lane: int, asking: Asking, work: TierScratch, world: World) -> None:
     screen = asking.screen
     ray = Cone(row(query.origin, lane), row(query.direction, lane), query.blur[lane], query.roughness[lane])
     if query.by_proxy[lane] != 0:
@@ -188,15 +190,40 @@ def _ask_screen(query: Query, lane: int, asking: Asking, world: World) -> None:
         shaded = PixelPoint(query.key.x[lane] + 0.5, query.key.y[lane] + 0.5, query.z_self[lane])
         color, w, confidence = screen_proxy(screen, ray, distance, shaded, lod)
     elif asking.method == TRACED:
-        hit = kept_hit(query.met, lane)
-        if hit.part == NOTHING or (asking.traces and world.materials.gleams[hit.material] != 0):
-            return
-        at = interaction(world.geometry, hit, Ray(ray.origin, ray.direction), 0.0)
-        color, w, confidence = screen_traced(screen, ray, at.point, at.ng, hit.t, asking.traces)
+        _ask_screen_traced(query, lane, asking, work, world)
+        return
     else:
         color, w, confidence = screen_march(screen, ray)
     _, w = update_headroom(1.0 - _headroom(query, lane), w)
     _add_covered(query, lane, SCREEN, (color[0], color[1], color[2]), color[3], w, confidence)
+
+
+@inlined
+def _ask_screen_traced(query: Query, lane: int, asking: Asking, work: TierScratch, world: World) -> None:
+    """Light the surface that the ray is known to meet as the picture shows it to be lit.
+
+    The picture knows that light to a pixel, and highlights as they are for the eye. Where rays are traced, a strong and
+    sharp leaf, and a surface that mirrors, are left to them.
+    """
+    hit = kept_hit(query.met, lane)
+    if hit.part == NOTHING:
+        return
+    sharp = query.blur[lane] <= 0.0
+    if asking.traces and sharp and (query.strong[lane] != 0 or world.materials.gleams[hit.material] != 0):
+        return
+    screen, surface = asking.screen, work.second
+    d = row(query.direction, lane)
+    at = interaction(world.geometry, hit, Ray(row(query.origin, lane), d), query.width[lane])
+    seen = light_seen(screen, at.point, flip_towards(at.ng, scale(d, -1.0)))
+    if not seen.known:
+        return
+    if not sharp:
+        r, g, b, coverage = screen_blurred(screen, seen, query.blur[lane], hit.t)
+        _add_covered(query, lane, SCREEN, (r, g, b), coverage, _headroom(query, lane), 1.0)
+        return
+    load_surface(surface, lane, at, world, scale(d, -1.0))
+    lit = scale(mul(row(surface.albedo, lane), seen.irradiance), 1.0 / math.pi)
+    _add(query, lane, SCREEN, add(add(row(surface.emissive, lane), lit), seen.gloss), _headroom(query, lane), 1.0)
 
 
 @inlined

@@ -51,6 +51,8 @@ _PIXELS = CELL * CELL
 # happens once on a way. It does so at most as often as rays may meet glass, which bounds the stack.
 _STACK = _PIXELS + 4 * LANES * (MOST_MET + 2)
 _LEAVES = 256
+_STRONG = 0.1
+"""Weight of a leaf above which its light is worth rays of its own."""
 
 # What a ray of a packet has come to.
 _ENDED, _MET, _PASSED_OUT, _NO_RAY = 0, 1, 2, 3
@@ -422,6 +424,8 @@ def _load_query(scratch: TreeScratch, asking: Asking, x0: int, y0: int, k: int, 
     keep_hit(query.met, lane, kept_hit(scratch.leaf_hits, k))
     inside = leaves.media.depth[k] > 0 and scratch.leaf_hits.part[k] != NOTHING
     query.embedded[lane] = 1 if inside else 0
+    strongest = max(leaves.weight[k, 0], leaves.weight[k, 1], leaves.weight[k, 2])
+    query.strong[lane] = 1 if strongest > _STRONG else 0
     query.by_proxy[lane] = 1 if asking.method == PROXY and leaves.side[k] == THROUGH_SIDE else 0
 
 

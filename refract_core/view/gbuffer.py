@@ -49,6 +49,10 @@ class OpaqueLayer(NamedTuple):
     """shape (H, W) z_depth [m]; inf where nothing was hit"""
     normal: F32_3D
     """shape (H, W, 3): geometric normal on the camera's side"""
+    irradiance: F32_3D
+    """shape (H, W, 3): diffuse light that arrives there"""
+    gloss: F32_3D
+    """shape (H, W, 3): radiance that is neither emitted nor diffuse: highlights and what is mirrored"""
     glass: U8_2D
     """shape (H, W): 1 where the camera's ray meets glass first"""
 
@@ -134,8 +138,11 @@ def _write_opaque(layer: OpaqueLayer, block: Block, world: World, view: View, x0
         _, direction, cosine = pixel_ray(view, x + 0.5, y + 0.5)
         if block.on[lane] != 0:
             for c in range(3):
+                diffuse = block.emissive[lane, c] + block.albedo[lane, c] * block.diffuse[lane, c] / math.pi
                 layer.color[y, x, c] = block.color[lane, c]
                 layer.normal[y, x, c] = block.ng[lane, c]
+                layer.irradiance[y, x, c] = block.diffuse[lane, c]
+                layer.gloss[y, x, c] = block.color[lane, c] - diffuse
             layer.depth[y, x] = block.distance[lane] * cosine
             layer.color[y, x, 3] = 1.0
             continue

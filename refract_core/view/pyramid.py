@@ -41,6 +41,9 @@ class ScreenBuffers(NamedTuple):
     depth_level: I64_2D
     normal: F32_3D
     """shape (H, W, 3): geometric, towards the viewer"""
+    irradiance: F32_3D
+    """shape (H, W, 3): as `gbuffer.OpaqueLayer`; so is the next"""
+    gloss: F32_3D
 
 
 class Screen(NamedTuple):
@@ -53,6 +56,8 @@ class Screen(NamedTuple):
     farthest: F32_1D
     depth_level: I64_2D
     normal: F32_3D
+    irradiance: F32_3D
+    gloss: F32_3D
 
 
 class BlurScratch(NamedTuple):
@@ -96,7 +101,7 @@ def new_screen_buffers(w: int, h: int, blurred: bool) -> ScreenBuffers:
         np.zeros(total(depths), np.float32),
         np.zeros(total(depths), np.float32),
         depths,
-        np.zeros((h, w, 3), np.float32),
+        *(np.zeros((h, w, 3), np.float32) for _ in range(3)),
     )
 
 

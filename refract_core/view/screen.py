@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..kernels.compile import inlined
-from ..kernels.vec import Vec, along, dot, row, sub
+from ..kernels.vec import Vec, along, dot, row, scale, sub
 from ..optics.lobes import Cone
 from ..probes.volumes import edge_fade
 from ..world.textures import Rgba
@@ -31,7 +31,6 @@ binomial filter of 2 texels^2 on each level, and half of a round Gaussian lies w
 _SAME = 0.02  # part of the way from eye to hit by which two pixels of one surface may disagree
 _ALIKE = 0.9  # cosine between normals of what may be one surface
 _COPLANAR = 0.002  # part of the depth by which a point may lie outside of a pixel's plane
-_EVEN, _DARK = 0.2, 0.01  # part of the brightest, and radiance, by which pixels of one light may differ
 _SLACK = 1.0  # how far outside its pixel a plane may be met, in pixels' worth of the ray
 
 
@@ -47,6 +46,23 @@ class ScreenHit(NamedTuple):
 
 
 _NOTHING = (0.0, 0.0, 0.0, 0.0)
+
+
+class SeenLight(NamedTuple):
+    """What the picture knows of the light at a place."""
+
+    known: bool
+    x: float
+    """pixel coordinate, continuous; so is y"""
+    y: float
+    z_depth: float
+    """[m]"""
+    irradiance: Vec
+    gloss: Vec
+    """highlights and what is mirrored, as the eye sees it"""
+
+
+_DARK = SeenLight(False, 0.0, 0.0, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
 class ScreenLight(NamedTuple):
@@ -216,53 +232,51 @@ def screen_march(screen: Screen, ray: Cone) -> ScreenLight:
 
 
 @inlined
-def screen_traced(screen: Screen, ray: Cone, point: Vec, ng: Vec, distance: float, strict: bool) -> ScreenLight:
-    """What the picture shows of the very surface that the ray is known to meet; nothing where it does not show it.
+def light_seen(screen: Screen, point: Vec, facing: Vec) -> SeenLight:
+    """The light that the picture shows to fall on the very place where a ray is known to end.
 
-    A pixel shows it if it sees a surface that faces the same way, in whose plane the point lies. Half of the bilinear
-    weight around the point must be of such pixels.
+    A pixel shows that surface if it sees one that faces the same way, and in whose plane the point lies. Half of the
+    bilinear weight around the point must be of such pixels. What they have in common is the light that falls there, not
+    the colour: a texture is looked up by whoever asks, as finely as it likes.
 
     Args:
         point: where the ray meets the surface [m].
-        ng: its unit geometric normal, on either side.
-        distance: along the ray [m].
-        strict: the pixels must also agree in colour; where they do not, light changes faster than pixels can tell
-            (below a thing that hovers, at the edge of a shadow or of a texel), and a ray of its own knows better.
+        facing: unit geometric normal there, on the ray's side.
     """
     width, height = int(screen.camera.size[0]), int(screen.camera.size[1])
     px, py, z = project(screen.camera, point)
     x, y = px - 0.5, py - 0.5
     if z <= 0.0 or not (x >= 0.0 and y >= 0.0 and x < width - 1 and y < height - 1):
-        return ScreenLight(_NOTHING, 0.0, 0.0)
-    facing = ng if dot(ng, ray.direction) < 0.0 else (-ng[0], -ng[1], -ng[2])
+        return _DARK
     x0, y0 = math.floor(x), math.floor(y)
     total = 0.0
-    r = g = b = 0.0
-    brightest, darkest = 0.0, math.inf
+    irradiance, gloss = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     for k in range(4):
         ix, iy = x0 + k % 2, y0 + k // 2
-        i = iy * width + ix
-        depth = screen.depth[i]
-        normal = row(screen.normal[iy], ix)
-        if depth == math.inf or dot(normal, facing) < _ALIKE:
+        depth = screen.depth[iy * width + ix]
+        if depth == math.inf or dot(row(screen.normal[iy], ix), facing) < _ALIKE:
             continue
         seen = pixel_point(screen.camera, ix + 0.5, iy + 0.5, np.float64(depth))
         if abs(dot(sub(seen, point), facing)) > _COPLANAR * z:
             continue
         w = (x - x0 if k % 2 else 1.0 - x + x0) * (y - y0 if k // 2 else 1.0 - y + y0)
         total += w
-        r += w * screen.color[i, 0]
-        g += w * screen.color[i, 1]
-        b += w * screen.color[i, 2]
-        level = screen.color[i, 0] + screen.color[i, 1] + screen.color[i, 2]
-        brightest, darkest = max(brightest, level), min(darkest, level)
-    if total < 0.5 or (strict and brightest - darkest > _EVEN * brightest + _DARK):
-        return ScreenLight(_NOTHING, 0.0, 0.0)
-    if ray.blur > 0.0:
-        lod = _level(screen, ray.blur, distance, z)
-        if lod > 0.0:
-            return ScreenLight(color_at(screen, px, py, lod), 1.0, 1.0)
-    return ScreenLight((r / total, g / total, b / total, 1.0), 1.0, 1.0)
+        irradiance = along(irradiance, row(screen.irradiance[iy], ix), w)
+        gloss = along(gloss, row(screen.gloss[iy], ix), w)
+    if total < 0.5:
+        return _DARK
+    return SeenLight(True, px, py, z, scale(irradiance, 1.0 / total), scale(gloss, 1.0 / total))
+
+
+@inlined
+def screen_blurred(screen: Screen, seen: SeenLight, blur: float, distance: float) -> Rgba:
+    """Colour and coverage over the cone of a rough ray, around where it ends.
+
+    Args:
+        blur: tangent of the cone's half angle.
+        distance: along the ray [m].
+    """
+    return color_at(screen, seen.x, seen.y, _level(screen, blur, distance, seen.z_depth))
 
 
 @inlined

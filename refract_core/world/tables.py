@@ -82,7 +82,7 @@ class MaterialTable(NamedTuple):
     priority: I32_1D
     """as `refraction:priority`"""
     gleams: U8_1D
-    """1 where what a surface shows depends on where it is seen from by more than a varnish does"""
+    """1 where what a surface shows depends on where it is seen from"""
 
 
 class World(NamedTuple):
@@ -144,7 +144,7 @@ def pack_materials(materials: Sequence[Material], slots: dict[str, int]) -> Mate
 
 
 def _gleams(material: Material) -> bool:
-    """Some of it may be metal, or have a strong colour of its own, and be smooth enough to show a highlight's shape."""
+    """Some of it may be so smooth that it mirrors the scene; metals, and what has a specular colour, do so sooner."""
 
     def least(param: Param) -> float:
         source = material.inputs[param]
@@ -152,7 +152,7 @@ def _gleams(material: Material) -> bool:
 
     metal = material.inputs[Param.METALLIC]
     strong = material.specular_workflow or metal.texture >= 0 or bool(metal.primvar) or metal.value[0] > 0.1
-    return strong and least(Param.ROUGHNESS) < 0.5
+    return least(Param.ROUGHNESS) < (0.5 if strong else 0.2)
 
 
 def _driven(material: Material) -> int:
