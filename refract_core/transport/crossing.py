@@ -121,7 +121,8 @@ class Meeting(NamedTuple):
 
 @inlined
 def meet(meeting: Meeting, lane: int, now: Rays, at: Interaction, world: World, rules: Rules) -> None:
-    """Say what the glass at a hit is to a ray, and look up its attributes. Bodies that fill no space are noted."""
+    """Say what the glass at a hit is to a ray, and look up its attributes. Bodies that fill no space are noted, and the
+    way to the hit is absorbed along."""
     geometry, materials, hit, media = world.geometry, world.materials, at.hit, now.media
     m, thing = hit.material, geometry.thing[hit.part]
     model = materials.model[m] if rules.model < 0 else rules.model
@@ -139,17 +140,16 @@ def meet(meeting: Meeting, lane: int, now: Rays, at: Interaction, world: World, 
     elif not is_walked(model) and slot == AIR:
         if outer or open_mesh:
             kind = ANSWERED if room else PASSED
-    elif not outer and now.inner[lane] == 0 and slot != AIR:
+    elif not outer and slot != AIR and (now.inner[lane] == 0 or now.thing[lane] != thing):
         kind = LEFT
     elif outer and is_walked(model):
         kind = ENTERED if room else PASSED
     elif is_walked(model) and now.met[lane] == 0 and now.side[lane] == VIEW and room:
         # The first surface, seen from inside: the near plane cut into this body.
         _note_medium(now, lane, meeting, lane, meeting.priority[lane])
-        now.begun[lane] = 0.0
-        absorb(now, lane, hit.t)
         slot = media.depth[lane] - 1
         kind = LEFT
+    absorb(now, lane, hit.t)
     meeting.slot[lane] = slot
     if kind == PASSED:
         meeting.kind[lane] = kind

@@ -305,8 +305,8 @@ def _meet_all(scratch: TreeScratch, world: World, asking: Asking, rules: Rules, 
             else:
                 scratch.state[lane] = _ENDED
             continue
-        absorb(now, lane, hit.t)
         if world.materials.model[hit.material] == Model.NONE.value:
+            absorb(now, lane, hit.t)
             scratch.state[lane] = _ENDED
             continue
         first = now.side[lane] == VIEW
