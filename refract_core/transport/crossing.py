@@ -233,7 +233,6 @@ def cross(meeting: Meeting, lane: int, now: Rays, rules: Rules) -> None:
     abbe_before = 0.0 if before == AIR else media.abbe[lane, before]
     channel = now.channel[lane]
     splits = channel == ALL_CHANNELS and (abbe_before > 0.0 or abbe_behind > 0.0)
-    n = row(meeting.n, lane)
     meeting.channels[lane] = 3 if splits else 1
     for c in range(3):
         k = c if splits else channel
@@ -243,9 +242,9 @@ def cross(meeting: Meeting, lane: int, now: Rays, rules: Rules) -> None:
                 n2 = index_in(media, lane, behind, k)
             else:
                 n2 = channel_ior(meeting.ior[lane], meeting.abbe[lane], k)
-            share, n = _bend(meeting, lane, c, d, n1, n2)
+            share = _bend(meeting, lane, c, d, n1, n2)
         _weigh(meeting, lane, now, c, share)
-    r = reflect(d, n)
+    r = reflect(d, row(meeting.n, lane))
     ng = row(meeting.ng, lane)
     if dot(r, ng) <= 0.0:
         r = reflect(d, ng)
@@ -264,8 +263,8 @@ def _filling_without(now: Rays, lane: int, slot: int) -> int:
 
 
 @inlined
-def _bend(meeting: Meeting, lane: int, c: int, d: Vec, n1: float, n2: float) -> tuple[float, Vec]:
-    """Reflectance of an interface, and the normal that it goes by; what goes through is noted as channel `c`."""
+def _bend(meeting: Meeting, lane: int, c: int, d: Vec, n1: float, n2: float) -> float:
+    """Reflectance of an interface; what goes through is noted as channel `c`."""
     n, ng = row(meeting.n, lane), row(meeting.ng, lane)
     if meeting.kind[lane] == ANSWERED:
         p, wo = row(meeting.point, lane), scale(d, -1.0)
@@ -275,7 +274,7 @@ def _bend(meeting: Meeting, lane: int, c: int, d: Vec, n1: float, n2: float) -> 
         put(meeting.exits[lane], c, leave)
         put(meeting.through[lane], c, out)
         meeting.length[lane, c] = length
-        return fresnel_dielectric(abs(dot(n, d)), n1 / n2), n
+        return fresnel_dielectric(abs(dot(n, d)), n1 / n2)
     passes, out = refract(d, n, n1 / n2)
     if passes and dot(out, ng) >= 0.0:
         if meeting.kind[lane] == LEFT:  # a steep shading normal must not keep it in by bending it
@@ -284,7 +283,7 @@ def _bend(meeting: Meeting, lane: int, c: int, d: Vec, n1: float, n2: float) -> 
             n = ng
             passes, out = refract(d, n, n1 / n2)
     put(meeting.through[lane], c, out)
-    return fresnel_dielectric(abs(dot(n, d)), n1 / n2) if passes else 1.0, n
+    return fresnel_dielectric(abs(dot(n, d)), n1 / n2) if passes else 1.0
 
 
 @inlined
