@@ -100,7 +100,7 @@ class Oracle:
     def _add_sample(self, sums: _Sums, x: int, y: int, k: int, nudge: tuple[float, float]) -> None:
         sight, view = self._through(x, y, k, nudge)
         tree = Tree(self.shader, self.settings, self.cut, self.spread, self.forward, self._on_screen(sight))
-        ray = Ray(sight.origin, sight.direction, sight.near, sight.far, media=self.around)
+        ray = Ray(sight.origin, sight.direction, sight.near, far=sight.far, media=self.around)
         grown = tree.grow(ray, view, lambda hit: self._backdrop(sight, view, hit))
         sums.add("beauty", [*grown.color, 1.0 - grown.missing])
         if grown.glassy:

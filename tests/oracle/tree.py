@@ -82,6 +82,8 @@ class Ray(NamedTuple):
     direction: Vec
     start: float = 0.0
     """along the direction, from where it looks [m]"""
+    begun: float = 0.0
+    """up to where the media have absorbed already [m]"""
     far: float = math.inf
     weight: Vec = WHITE
     clear: Vec = WHITE
@@ -100,13 +102,13 @@ class Ray(NamedTuple):
     branch: int = 0
     inner: Inner | None = None
 
-    def absorb(self, length: float) -> Ray:
-        """A stretch of what fills the space."""
+    def absorb(self, t: float) -> Ray:
+        """What fills the space, up to a distance; at first from the eye, wherever the near plane is."""
         medium = filling(self.media)
         if medium is None:
-            return self
-        left = absorbed(medium.tint, medium.distance, length)
-        return self._replace(weight=mul(self.weight, left), way=self.way + length)
+            return self._replace(begun=t)
+        left = absorbed(medium.tint, medium.distance, t - self.begun)
+        return self._replace(weight=mul(self.weight, left), way=self.way + t - self.begun, begun=t)
 
     def passed(self, t: float, media: Media) -> Ray:
         """On behind a surface that is nothing to it."""
@@ -191,7 +193,7 @@ class Tree:
             return []
         hit = self._met(ray, view)
         if hit is None and ray.inner is not None:
-            return [_out(ray.absorb(ray.far - ray.start), ray.inner)]
+            return [_out(ray.absorb(ray.far), ray.inner)]
         if hit is None or hit.face.kind == OPAQUE:
             if ray.side is Side.VIEW:
                 grown.bare = hit
@@ -202,7 +204,7 @@ class Tree:
                 self._end(ray, hit, view, grown)
             return []
         choice = self._choice(ray, hit)
-        ray = choice.ray.absorb(hit.t - ray.start)
+        ray = choice.ray.absorb(hit.t)
         if choice.step is Step.PASSES:
             return [ray.passed(hit.t, choice.behind)]
         return self._split(ray, hit, choice, view, grown)
@@ -215,8 +217,7 @@ class Tree:
         hit = first(self._candidates(ray, ray.start, ray.far, kinds), self._present(ray, view))
         if hit is None or hit.face.kind == OPAQUE:
             return hit
-        # Rule 2; and what a ray passes straight does not hide a table that is in the same place either.
-        if ray.media or self._choice(ray, hit).step is Step.PASSES:
+        if ray.media or (ray.entered > 0 and dot(hit.ng, ray.direction) > 0.0):  # rule 2
             near = _CONTACT[0] * max(abs(c) for c in hit.point) + _CONTACT[1]
             touching = self._candidates(ray, max(0.0, hit.t - near), hit.t + near, OPAQUE)
             hit = first(touching, self._present(ray, view)) or hit
@@ -246,10 +247,14 @@ class Tree:
             if len(media) >= MOST:
                 return straight
             body = medium_at(self.scene, hit, model)
-            behind = (*media, body)
+            before = filling(media)
             if model is not Model.TRACED:
-                return Choice(ray, Step.TYPED, body, behind)
-            return Choice(ray, Step.ENTERS if filling(behind) is body else Step.PASSES, body, behind)
+                if before is not None:  # whatever is around, along the stretch it is the model's body that counts
+                    body = body._replace(priority=max(body.priority, before.priority))
+                return Choice(ray, Step.TYPED, body, (*media, body))
+            behind = (*media, body)
+            again = before is not None and before.thing == thing
+            return Choice(ray, Step.ENTERS if filling(behind) is body and not again else Step.PASSES, body, behind)
         if inner and not within and self._is_cut(ray, hit, model):
             media = (*media, medium_at(self.scene, hit, model))
             within, ray = True, ray._replace(media=media)
@@ -270,7 +275,7 @@ class Tree:
     def _split(self, ray: Ray, hit: Hit, choice: Choice, view: View, grown: Grown) -> list[Ray]:
         d, step = ray.direction, choice.step
         s = surface_at(self.scene, hit, scaled(d, -1.0))
-        if step is not Step.LEAVES and dot(s.ns, d) >= 0.0:
+        if dot(s.ns, d) >= 0.0:
             s = s._replace(ns=s.ng)
         model = model_at(self.scene, hit, self.settings.model)
         if grown.front is None:
@@ -351,7 +356,7 @@ class Tree:
         """What both ways have in common; as it is, it goes back into the media it came from."""
         way = Side.THROUGH if step == sampling.THROUGH else Side.MIRRORED
         return ray._replace(
-            origin=s.point, start=0.0, far=math.inf, weight=part.weight, clear=part.clear, inner=None,
+            origin=s.point, start=0.0, begun=0.0, far=math.inf, weight=part.weight, clear=part.clear, inner=None,
             side=way if ray.side is Side.VIEW else ray.side, roughness=max(ray.roughness, s.roughness),
             met=ray.met + 1, branch=sampling.branched(ray.branch, step),
         )  # fmt: skip
@@ -397,7 +402,7 @@ class Tree:
     def _end(self, ray: Ray, hit: Hit | None, view: View, grown: Grown, lost: bool = False) -> None:
         embedded = hit is not None and bool(ray.media)
         if hit is not None:
-            ray = ray.absorb(hit.t - ray.start)
+            ray = ray.absorb(hit.t)
         if ray.met >= _FORGOTTEN and max(ray.weight) >= _HEEDED:
             self.shader.unsure = True
         back = ray.side is Side.MIRRORED
@@ -447,7 +452,7 @@ def _out(ray: Ray, inner: Inner) -> Ray:
     media = tuple(m for m in ray.media if m is not inner.body)
     passage = inner.passage
     return ray._replace(
-        origin=passage.point, direction=passage.direction, start=0.0, far=math.inf, media=media, inner=None
+        origin=passage.point, direction=passage.direction, start=0.0, begun=0.0, far=math.inf, media=media, inner=None
     )
 
 
