@@ -23,6 +23,7 @@ from ..view.camera import Tile, View, pixel_ray
 from ..view.gbuffer import OpaqueLayer, pixel_spread
 from ..view.planes import Planes
 from ..world.embree import COHERENT, EVERYTHING, OPAQUE, SCATTERED, Packet, clear, has_hit, set_ray
+from ..world.environment import TEXEL_LUMINANCE
 from ..world.offsets import tie
 from ..world.shading import Block, gather, load_surface
 from ..world.surface import NOTHING, HitLanes, Ray, hit_in, interaction, keep_hit, kept_hit
@@ -77,7 +78,7 @@ class Cell(NamedTuple):
     share: F64_1D
     """sum of their shares"""
     largest: F64_1D
-    """share of the largest of them"""
+    """clear weight of the brightest of them"""
     path: F64_1D
     """its way inside media [m]"""
     entered: I32_1D
@@ -450,8 +451,10 @@ def _add_leaf(cell: Cell, leaves: Rays, query: Query, k: int, lane: int, view: V
     if leaves.lost[k] == 0:
         cell.confidence[i] += share * query.confidence[lane]
     cell.share[i] += share
-    if share > cell.largest[i]:
-        cell.largest[i] = share
+    # By luminance: the three colours that a dispersive glass lets out often have the same weight, but for rounding.
+    bright = dot(row(leaves.clear, k), TEXEL_LUMINANCE)
+    if bright > cell.largest[i]:
+        cell.largest[i] = bright
         cell.path[i] = leaves.path[k]
         cell.entered[i] = leaves.entered[k]
 
