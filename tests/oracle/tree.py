@@ -45,6 +45,8 @@ _HEEDED = 1e-3
 """Of a pixel's light; what weighs less may be elsewhere, or not be."""
 _CLOSE = 1e-5
 """Relative: numbers nearer than this may compare the other way in float32."""
+_BESIDE = (1e-5, 1e-6)
+"""How far from a surface a ray starts that leaves it: relative to the place, and in metres."""
 _CONTACT = (4e-5, 4e-6)
 """Glass stands on a table where they are nearer than this: relative to the place, and in metres."""
 
@@ -311,7 +313,7 @@ class Tree:
             child = self._follower(ray, s, back, sampling.GLANCED)
             blur = math.hypot(ray.blur, 2.0 * s.roughness**2)
             entered = ray.entered + (step is not Step.LEAVES)
-            rays.append(child._replace(direction=optics.glanced(d, s.ns, s.ng), blur=blur, entered=entered))
+            rays.append(_beside(child._replace(direction=optics.glanced(d, s.ns, s.ng), blur=blur, entered=entered), s))
         return rays
 
     def _of_channel(self, ray: Ray, s: Surface, step: Step, eta: float) -> Split:
@@ -365,13 +367,13 @@ class Tree:
         step, body, bent = choice.step, choice.body, way.split.transmitted
         if step is Step.LEAVES:
             assert bent is not None
-            return child._replace(direction=bent, media=choice.behind)
+            return _beside(child._replace(direction=bent, media=choice.behind), s)
         assert body is not None
         rough = 2.0 * optics.transmitted_roughness(s.roughness, body.ior) ** 2
         child = child._replace(blur=math.hypot(child.blur, rough), entered=child.entered + 1)
         if step is Step.ENTERS:
             assert bent is not None
-            return child._replace(direction=bent, media=choice.behind)
+            return _beside(child._replace(direction=bent, media=choice.behind), s)
         model = model_at(self.scene, hit, self.settings.model)
         passage = _passage(model, s, max(way.ratio, 1.0), thickness_at(self.scene, hit, model))
         if step is Step.PANE:
@@ -384,7 +386,7 @@ class Tree:
         if self.by_proxy or passage.path == 0.0:
             return _out(child.absorb(passage.path), Inner(body, passage))
         inside = unit(sub(passage.point, s.point))
-        return child._replace(direction=inside, far=passage.path, inner=Inner(body, passage))
+        return _beside(child._replace(direction=inside, far=passage.path, inner=Inner(body, passage)), s)
 
     def _shine(self, ray: Ray, s: Surface, opacity: float, view: View, grown: Grown) -> None:
         """Of the surface itself. What the first one sends out by itself is in neither of the planes."""
@@ -445,6 +447,13 @@ class _Way(NamedTuple):
 
 def _only(channel: int) -> Vec:
     return (float(channel == 0), float(channel == 1), float(channel == 2))
+
+
+def _beside(ray: Ray, s: Surface) -> Ray:
+    """It does not start on the surface, but a little to the side it goes to. What runs round in a ball doubles such a step
+    at each reflection, so this is part of where it comes to."""
+    step = math.copysign(_BESIDE[0] * max(abs(c) for c in s.point) + _BESIDE[1], dot(s.ng, ray.direction))
+    return ray._replace(origin=add(s.point, scaled(s.ng, step)))
 
 
 def _out(ray: Ray, inner: Inner) -> Ray:
