@@ -148,6 +148,7 @@ def meet(meeting: Meeting, lane: int, now: Rays, at: Interaction, world: World, 
         # The first surface, seen from inside: the near plane cut into this body.
         _note_medium(now, lane, meeting, lane, meeting.priority[lane])
         slot = media.depth[lane] - 1
+        now.thing[lane] = thing
         kind = LEFT
     absorb(now, lane, hit.t)
     meeting.slot[lane] = slot

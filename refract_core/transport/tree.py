@@ -421,7 +421,7 @@ def _load_query(scratch: TreeScratch, asking: Asking, x0: int, y0: int, k: int, 
     keep_hit(query.met, lane, kept_hit(scratch.leaf_hits, k))
     inside = leaves.media.depth[k] > 0 and scratch.leaf_hits.part[k] != NOTHING
     query.embedded[lane] = 1 if inside else 0
-    query.by_proxy[lane] = 1 if asking.method == PROXY and leaves.side[k] == THROUGH_SIDE else 0
+    query.by_proxy[lane] = 1 if asking.method == PROXY and leaves.side[k] != MIRRORED_SIDE else 0
 
 
 @inlined
