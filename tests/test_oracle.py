@@ -29,7 +29,7 @@ F32 = NDArray[np.float32]
 WIDTH, HEIGHT = 16, 12
 SCENES = 60
 _NUDGES = [
-    (r * math.cos(k * math.pi / 4), r * math.sin(k * math.pi / 4)) for r in (1e-3, 2e-3) for k in range(8)
+    (r * math.cos(k * math.pi / 4), r * math.sin(k * math.pi / 4)) for r in (1e-5, 1e-4) for k in range(8)
 ]
 """As far aside as the offsets of some 24 interfaces move a ray: each by 5e-6 m, where a pixel is 0.1 m wide."""
 # Relative, and below 0.1 absolute. Rays leave surfaces from 1e-5 of the place and 1e-6 m beside them, many times over.

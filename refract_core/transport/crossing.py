@@ -123,7 +123,8 @@ class Meeting(NamedTuple):
 
 @inlined
 def meet(meeting: Meeting, lane: int, now: Rays, at: Interaction, world: World, rules: Rules) -> None:
-    """Say what the glass at a hit is to a ray, and look up its attributes. Bodies that fill no space are noted."""
+    """Say what the glass at a hit is to a ray, and look up its attributes. Bodies that fill no space are noted, and the
+    way to the hit is absorbed along."""
     geometry, materials, hit, media = world.geometry, world.materials, at.hit, now.media
     m, thing = hit.material, geometry.thing[hit.part]
     model = materials.model[m] if rules.model < 0 else rules.model
@@ -141,17 +142,17 @@ def meet(meeting: Meeting, lane: int, now: Rays, at: Interaction, world: World, 
     elif not is_walked(model) and slot == AIR:
         if outer or open_mesh:
             kind = ANSWERED if room else PASSED
-    elif not outer and now.inner[lane] == 0 and slot != AIR:
+    elif not outer and slot != AIR and (now.inner[lane] == 0 or now.thing[lane] != thing):
         kind = LEFT
     elif outer and is_walked(model):
         kind = ENTERED if room else PASSED
     elif is_walked(model) and now.met[lane] == 0 and now.side[lane] == VIEW and room:
         # The first surface, seen from inside: the near plane cut into this body.
         _note_medium(now, lane, meeting, lane, meeting.priority[lane])
-        now.begun[lane] = 0.0
-        absorb(now, lane, hit.t)
         slot = media.depth[lane] - 1
+        now.thing[lane] = thing
         kind = LEFT
+    absorb(now, lane, hit.t)
     meeting.slot[lane], meeting.t[lane] = slot, hit.t
     if kind == PASSED:
         meeting.kind[lane] = kind
@@ -235,7 +236,6 @@ def cross(meeting: Meeting, lane: int, now: Rays, rules: Rules) -> None:
     abbe_before = 0.0 if before == AIR else media.abbe[lane, before]
     channel = now.channel[lane]
     splits = channel == ALL_CHANNELS and (abbe_before > 0.0 or abbe_behind > 0.0)
-    n = row(meeting.n, lane)
     meeting.channels[lane] = 3 if splits else 1
     for c in range(3):
         k = c if splits else channel
@@ -245,9 +245,9 @@ def cross(meeting: Meeting, lane: int, now: Rays, rules: Rules) -> None:
                 n2 = index_in(media, lane, behind, k)
             else:
                 n2 = channel_ior(meeting.ior[lane], meeting.abbe[lane], k)
-            share, n = _bend(meeting, lane, c, d, n1, n2)
+            share = _bend(meeting, lane, c, d, n1, n2)
         _weigh(meeting, lane, now, c, share)
-    r = reflect(d, n)
+    r = reflect(d, row(meeting.n, lane))
     ng = row(meeting.ng, lane)
     if dot(r, ng) <= 0.0:
         r = reflect(d, ng)
@@ -266,8 +266,8 @@ def _filling_without(now: Rays, lane: int, slot: int) -> int:
 
 
 @inlined
-def _bend(meeting: Meeting, lane: int, c: int, d: Vec, n1: float, n2: float) -> tuple[float, Vec]:
-    """Reflectance of an interface, and the normal that it goes by; what goes through is noted as channel `c`."""
+def _bend(meeting: Meeting, lane: int, c: int, d: Vec, n1: float, n2: float) -> float:
+    """Reflectance of an interface; what goes through is noted as channel `c`."""
     n, ng = row(meeting.n, lane), row(meeting.ng, lane)
     if meeting.kind[lane] == ANSWERED:
         p, wo = row(meeting.point, lane), scale(d, -1.0)
@@ -277,7 +277,7 @@ def _bend(meeting: Meeting, lane: int, c: int, d: Vec, n1: float, n2: float) -> 
         put(meeting.exits[lane], c, leave)
         put(meeting.through[lane], c, out)
         meeting.length[lane, c] = length
-        return fresnel_dielectric(abs(dot(n, d)), n1 / n2), n
+        return fresnel_dielectric(abs(dot(n, d)), n1 / n2)
     passes, out = refract(d, n, n1 / n2)
     if passes and dot(out, ng) >= 0.0:
         if meeting.kind[lane] == LEFT:  # a steep shading normal must not keep it in by bending it
@@ -286,7 +286,7 @@ def _bend(meeting: Meeting, lane: int, c: int, d: Vec, n1: float, n2: float) -> 
             n = ng
             passes, out = refract(d, n, n1 / n2)
     put(meeting.through[lane], c, out)
-    return fresnel_dielectric(abs(dot(n, d)), n1 / n2) if passes else 1.0, n
+    return fresnel_dielectric(abs(dot(n, d)), n1 / n2) if passes else 1.0
 
 
 @inlined

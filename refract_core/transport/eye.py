@@ -14,8 +14,8 @@ from .rays import ALL_CHANNELS, MOST_MEDIA, VIEW, Rays, add_medium, new_rays
 def view_ray(scene: Scene, camera: Camera, model: str) -> Rays:
     """One row: a ray of the whole light, without place or direction.
 
-    The eye is in every closed body that is traced and that winds around it; the smallest is entered last. An
-    orthographic camera has no eye.
+    The eye is in every closed body that is traced and that winds around it; the smallest is entered last, and is what
+    the ray is said to have entered. An orthographic camera has no eye.
 
     Args:
         model: token that overrides all materials' models, or ''.
@@ -39,6 +39,7 @@ def view_ray(scene: Scene, camera: Camera, model: str) -> Rays:
     for _, thing, material in sorted(around, key=lambda body: -body[0])[-MOST_MEDIA:]:
         r, g, b = (float(c) for c in material.inputs[Param.TRANSMITTANCE].value[:3])
         ior = max(1.0, float(material.inputs[Param.IOR].value[0]))
+        ray.thing[:] = thing
         add_medium(ray.media, 0, thing, material.priority, ior, material.abbe, (r, g, b), material.absorption_distance)
     return ray
 

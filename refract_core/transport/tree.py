@@ -23,6 +23,7 @@ from ..view.camera import Tile, View, pixel_ray
 from ..view.gbuffer import OpaqueLayer
 from ..view.planes import Planes
 from ..world.embree import COHERENT, EVERYTHING, OPAQUE, SCATTERED, Packet, clear, has_hit, set_ray
+from ..world.environment import TEXEL_LUMINANCE
 from ..world.offsets import tie
 from ..world.shading import Block, gather, load_surface
 from ..world.surface import NOTHING, HitLanes, Ray, hit_in, interaction, keep_hit, kept_hit
@@ -79,7 +80,7 @@ class Cell(NamedTuple):
     share: F64_1D
     """sum of their shares"""
     largest: F64_1D
-    """share of the largest of them"""
+    """clear weight of the brightest of them"""
     path: F64_1D
     """its way inside media [m]"""
     entered: I32_1D
@@ -308,8 +309,8 @@ def _meet_all(scratch: TreeScratch, world: World, asking: Asking, rules: Rules, 
             else:
                 scratch.state[lane] = _ENDED
             continue
-        absorb(now, lane, hit.t)
         if world.materials.model[hit.material] == Model.NONE.value:
+            absorb(now, lane, hit.t)
             scratch.state[lane] = _ENDED
             continue
         first = now.side[lane] == VIEW
@@ -426,7 +427,7 @@ def _load_query(scratch: TreeScratch, asking: Asking, x0: int, y0: int, k: int, 
     query.embedded[lane] = 1 if inside else 0
     strongest = max(leaves.weight[k, 0], leaves.weight[k, 1], leaves.weight[k, 2])
     query.strong[lane] = 1 if strongest > _STRONG else 0
-    query.by_proxy[lane] = 1 if asking.method == PROXY and leaves.side[k] == THROUGH_SIDE else 0
+    query.by_proxy[lane] = 1 if asking.method == PROXY and leaves.side[k] != MIRRORED_SIDE else 0
 
 
 @inlined
@@ -456,8 +457,10 @@ def _add_leaf(cell: Cell, leaves: Rays, query: Query, k: int, lane: int, view: V
     if leaves.lost[k] == 0:
         cell.confidence[i] += share * query.confidence[lane]
     cell.share[i] += share
-    if share > cell.largest[i]:
-        cell.largest[i] = share
+    # By luminance: the three colours that a dispersive glass lets out often have the same weight, but for rounding.
+    bright = dot(row(leaves.clear, k), TEXEL_LUMINANCE)
+    if bright > cell.largest[i]:
+        cell.largest[i] = bright
         cell.path[i] = leaves.path[k]
         cell.entered[i] = leaves.entered[k]
 

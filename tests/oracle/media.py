@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from refract_core.scene import Model, Param, Scene
@@ -86,8 +87,8 @@ def thickness_at(scene: Scene, hit: Hit, model: Model) -> float:
 
 
 def media_around(shader: Shader, eye: Vec, override: str) -> Media:
-    """Closed traced bodies that the eye is in, the one that it would leave last first. Each has the attributes of the
-    nearest place where one of the eight rays leaves it."""
+    """Closed traced bodies that the eye is in, the largest first. Each has the attributes of the nearest place where one
+    of the eight rays leaves it."""
     scene = shader.scene
     votes: dict[int, int] = {}
     exits: dict[int, Hit] = {}
@@ -102,5 +103,11 @@ def media_around(shader: Shader, eye: Vec, override: str) -> Media:
                 exits[thing] = hit
         for thing, count in more.items():
             votes[thing] = votes.get(thing, 0) + (count > 0)
-    around = sorted((thing for thing, n in votes.items() if n >= _ENOUGH), key=lambda thing: -exits[thing].t)
+    around = sorted((thing for thing, n in votes.items() if n >= _ENOUGH), key=lambda thing: -_bounds(shader, thing))
     return tuple(medium_at(scene, exits[thing], Model.TRACED) for thing in around[-MOST:])
+
+
+def _bounds(shader: Shader, thing: int) -> float:
+    """Volume of the box around a body."""
+    body = shader.world.bodies[thing]
+    return math.prod(high - low for low, high in zip(body.low, body.high, strict=True))

@@ -42,6 +42,7 @@ class Sight(NamedTuple):
 
 
 _WEIGHTS = ("screen", "ray", "probe", "sky", "none")
+_LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. ITU-R BT.709
 _CLOSE = 1e-5
 """Relative: of two leaves whose weights are nearer than this, float32 may find either the stronger."""
 
@@ -101,7 +102,7 @@ class Oracle:
     def _add_sample(self, sums: _Sums, x: int, y: int, k: int, nudge: tuple[float, float]) -> None:
         sight, view = self._through(x, y, k, nudge)
         tree = Tree(self.shader, self.settings, self.cut, self.spread, self.forward, self._on_screen(sight))
-        ray = Ray(sight.origin, sight.direction, sight.near, sight.far, media=self.around)
+        ray = Ray(sight.origin, sight.direction, sight.near, far=sight.far, media=self.around)
         grown = tree.grow(ray, view, lambda hit: self._backdrop(sight, view, hit))
         sums.add("beauty", [*grown.color, 1.0 - grown.missing])
         if grown.glassy:
@@ -188,9 +189,10 @@ class Oracle:
         if k == 0:
             sums.keep("thickness", [grown.front.thickness if grown.front is not None else 0.0])
             if grown.ends:
-                self._note_strongest(sums, strengths, grown.ends)
+                self._note_strongest(sums, grown.ends)
 
-    def _note_strongest(self, sums: _Sums, strengths: list[float], ends: list[End]) -> None:
+    def _note_strongest(self, sums: _Sums, ends: list[End]) -> None:
+        strengths = [dot(end.ray.clear, _LUMINANCE) for end in ends]
         most = max(strengths)
         way, layers = next((end.ray.way, end.ray.entered) for s, end in zip(strengths, ends, strict=True) if s == most)
         for s, end in zip(strengths, ends, strict=True):

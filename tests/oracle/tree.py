@@ -39,12 +39,14 @@ _MOST_MET = 128
 _LATE = 96
 """After so many a ray is let out at the next occasion."""
 _FAINT = 1.0 / 32.0
-_FORGOTTEN = 8
+_FORGOTTEN = 24
 """After so many interfaces, each of which may double an error, float32 does not say any more where a ray is."""
 _HEEDED = 1e-3
 """Of a pixel's light; what weighs less may be elsewhere, or not be."""
 _CLOSE = 1e-5
 """Relative: numbers nearer than this may compare the other way in float32."""
+_BESIDE = (1e-5, 1e-6)
+"""How far from a surface a ray starts that leaves it: relative to the place, and in metres."""
 _CONTACT = (4e-5, 4e-6)
 """Glass stands on a table where they are nearer than this: relative to the place, and in metres."""
 
@@ -82,6 +84,8 @@ class Ray(NamedTuple):
     direction: Vec
     start: float = 0.0
     """along the direction, from where it looks [m]"""
+    begun: float = 0.0
+    """up to where the media have absorbed already [m]"""
     far: float = math.inf
     weight: Vec = WHITE
     clear: Vec = WHITE
@@ -102,13 +106,13 @@ class Ray(NamedTuple):
     branch: int = 0
     inner: Inner | None = None
 
-    def absorb(self, length: float) -> Ray:
-        """A stretch of what fills the space."""
+    def absorb(self, t: float) -> Ray:
+        """What fills the space, up to a distance; at first from the eye, wherever the near plane is."""
         medium = filling(self.media)
         if medium is None:
-            return self
-        left = absorbed(medium.tint, medium.distance, length)
-        return self._replace(weight=mul(self.weight, left), way=self.way + length)
+            return self._replace(begun=t)
+        left = absorbed(medium.tint, medium.distance, t - self.begun)
+        return self._replace(weight=mul(self.weight, left), way=self.way + t - self.begun, begun=t)
 
     def passed(self, t: float, media: Media) -> Ray:
         """On behind a surface that is nothing to it."""
@@ -193,7 +197,7 @@ class Tree:
             return []
         hit = self._met(ray, view)
         if hit is None and ray.inner is not None:
-            return [_out(ray.absorb(ray.far - ray.start), ray.inner)]
+            return [_out(ray.absorb(ray.far), ray.inner)]
         if hit is None or hit.face.kind == OPAQUE:
             if ray.side is Side.VIEW:
                 grown.bare = hit
@@ -204,7 +208,7 @@ class Tree:
                 self._end(ray, hit, view, grown)
             return []
         choice = self._choice(ray, hit)
-        ray = choice.ray.absorb(hit.t - ray.start)
+        ray = choice.ray.absorb(hit.t)
         if choice.step is Step.PASSES:
             return [ray.passed(hit.t, choice.behind)]
         return self._split(ray, hit, choice, view, grown)
@@ -217,8 +221,7 @@ class Tree:
         hit = first(self._candidates(ray, ray.start, ray.far, kinds), self._present(ray, view))
         if hit is None or hit.face.kind == OPAQUE:
             return hit
-        # Rule 2; and what a ray passes straight does not hide a table that is in the same place either.
-        if ray.media or self._choice(ray, hit).step is Step.PASSES:
+        if ray.media or (ray.entered > 0 and dot(hit.ng, ray.direction) > 0.0):  # rule 2
             near = _CONTACT[0] * max(abs(c) for c in hit.point) + _CONTACT[1]
             touching = self._candidates(ray, max(0.0, hit.t - near), hit.t + near, OPAQUE)
             hit = first(touching, self._present(ray, view)) or hit
@@ -246,10 +249,14 @@ class Tree:
             if len(media) >= MOST:
                 return straight
             body = medium_at(self.scene, hit, model)
-            behind = (*media, body)
+            before = filling(media)
             if model is not Model.TRACED:
-                return Choice(ray, Step.TYPED, body, behind)
-            return Choice(ray, Step.ENTERS if filling(behind) is body else Step.PASSES, body, behind)
+                if before is not None:  # whatever is around, along the stretch it is the model's body that counts
+                    body = body._replace(priority=max(body.priority, before.priority))
+                return Choice(ray, Step.TYPED, body, (*media, body))
+            behind = (*media, body)
+            again = before is not None and before.thing == thing
+            return Choice(ray, Step.ENTERS if filling(behind) is body and not again else Step.PASSES, body, behind)
         if inner and not within and self._is_cut(ray, hit, model):
             media = (*media, medium_at(self.scene, hit, model))
             within, ray = True, ray._replace(media=media)
@@ -270,7 +277,7 @@ class Tree:
     def _split(self, ray: Ray, hit: Hit, choice: Choice, view: View, grown: Grown) -> list[Ray]:
         d, step = ray.direction, choice.step
         s = surface_at(self.scene, hit, scaled(d, -1.0))
-        if step is not Step.LEAVES and dot(s.ns, d) >= 0.0:
+        if dot(s.ns, d) >= 0.0:
             s = s._replace(ns=s.ng)
         model = model_at(self.scene, hit, self.settings.model)
         if grown.front is None:
@@ -306,7 +313,7 @@ class Tree:
             child = self._follower(ray, hit.t, s, back, sampling.GLANCED)
             blur = math.hypot(ray.blur, 2.0 * s.roughness**2)
             entered = ray.entered + (step is not Step.LEAVES)
-            rays.append(child._replace(direction=optics.glanced(d, s.ns, s.ng), blur=blur, entered=entered))
+            rays.append(_beside(child._replace(direction=optics.glanced(d, s.ns, s.ng), blur=blur, entered=entered), s))
         return rays
 
     def _of_channel(self, ray: Ray, s: Surface, step: Step, eta: float) -> Split:
@@ -351,7 +358,7 @@ class Tree:
         """What both ways have in common; as it is, it goes back into the media it came from."""
         way = Side.THROUGH if step == sampling.THROUGH else Side.MIRRORED
         return ray._replace(
-            origin=s.point, start=0.0, far=math.inf, weight=part.weight, clear=part.clear, inner=None,
+            origin=s.point, start=0.0, begun=0.0, far=math.inf, weight=part.weight, clear=part.clear, inner=None,
             side=way if ray.side is Side.VIEW else ray.side, roughness=max(ray.roughness, s.roughness),
             met=ray.met + 1, branch=sampling.branched(ray.branch, step), travelled=ray.travelled + t,
         )  # fmt: skip
@@ -360,13 +367,13 @@ class Tree:
         step, body, bent = choice.step, choice.body, way.split.transmitted
         if step is Step.LEAVES:
             assert bent is not None
-            return child._replace(direction=bent, media=choice.behind)
+            return _beside(child._replace(direction=bent, media=choice.behind), s)
         assert body is not None
         rough = 2.0 * optics.transmitted_roughness(s.roughness, body.ior) ** 2
         child = child._replace(blur=math.hypot(child.blur, rough), entered=child.entered + 1)
         if step is Step.ENTERS:
             assert bent is not None
-            return child._replace(direction=bent, media=choice.behind)
+            return _beside(child._replace(direction=bent, media=choice.behind), s)
         model = model_at(self.scene, hit, self.settings.model)
         passage = _passage(model, s, max(way.ratio, 1.0), thickness_at(self.scene, hit, model))
         if step is Step.PANE:
@@ -379,7 +386,7 @@ class Tree:
         if self.by_proxy or passage.path == 0.0:
             return _out(child.absorb(passage.path), Inner(body, passage))
         inside = unit(sub(passage.point, s.point))
-        return child._replace(direction=inside, far=passage.path, inner=Inner(body, passage))
+        return _beside(child._replace(direction=inside, far=passage.path, inner=Inner(body, passage)), s)
 
     def _shine(self, ray: Ray, s: Surface, opacity: float, view: View, grown: Grown) -> None:
         """Of the surface itself. What the first one sends out by itself is in neither of the planes."""
@@ -397,7 +404,7 @@ class Tree:
     def _end(self, ray: Ray, hit: Hit | None, view: View, grown: Grown, lost: bool = False) -> None:
         embedded = hit is not None and bool(ray.media)
         if hit is not None:
-            ray = ray.absorb(hit.t - ray.start)
+            ray = ray.absorb(hit.t)
         if ray.met >= _FORGOTTEN and max(ray.weight) >= _HEEDED:
             self.shader.unsure = True
         back = ray.side is Side.MIRRORED
@@ -442,12 +449,19 @@ def _only(channel: int) -> Vec:
     return (float(channel == 0), float(channel == 1), float(channel == 2))
 
 
+def _beside(ray: Ray, s: Surface) -> Ray:
+    """It does not start on the surface, but a little to the side it goes to. What runs round in a ball doubles such a step
+    at each reflection, so this is part of where it comes to."""
+    step = math.copysign(_BESIDE[0] * max(abs(c) for c in s.point) + _BESIDE[1], dot(s.ng, ray.direction))
+    return ray._replace(origin=add(s.point, scaled(s.ng, step)))
+
+
 def _out(ray: Ray, inner: Inner) -> Ray:
     """From a typed model's exit, out of its body."""
     media = tuple(m for m in ray.media if m is not inner.body)
     passage = inner.passage
     return ray._replace(
-        origin=passage.point, direction=passage.direction, start=0.0, far=math.inf, media=media, inner=None,
+        origin=passage.point, direction=passage.direction, start=0.0, begun=0.0, far=math.inf, media=media, inner=None,
         travelled=ray.travelled + passage.path,
     )  # fmt: skip
 
