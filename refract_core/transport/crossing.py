@@ -139,7 +139,7 @@ def meet(meeting: Meeting, lane: int, now: Rays, at: Interaction, world: World, 
     elif not is_walked(model) and slot == AIR:
         if outer or open_mesh:
             kind = ANSWERED if room else PASSED
-    elif not outer and now.inner[lane] == 0 and slot != AIR:
+    elif not outer and slot != AIR and (now.inner[lane] == 0 or thing != now.thing[lane]):
         kind = LEFT
     elif outer and is_walked(model):
         kind = ENTERED if room else PASSED
