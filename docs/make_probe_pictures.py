@@ -54,7 +54,7 @@ class Panel(NamedTuple):
     show: str = "beauty"
     """`beauty`, `weight.probe` in false colour, or `tiers`: who answered"""
     time_code: float | None = None
-    screen: str = "march"
+    screen: str = "traced"
     samples: int = 16
 
 

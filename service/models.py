@@ -53,9 +53,9 @@ class Render(StageOnly):
     image_height: Annotated[int, Field(ge=0, le=1 << 28, description="0 follows the camera's aspect")] | None = None
     samples: Annotated[int, Field(ge=1, le=4096)] | None = None
     tiers: Annotated[list[Tier], Field(min_length=1, max_length=4), _Once] | None = None
-    screen: Literal["march", "proxy"] | None = None
+    screen: Literal["march", "proxy", "traced"] | None = None
     model: Model | None = None
-    max_layers: Annotated[int, Field(ge=1, le=32)] | None = None
+    max_layers: Annotated[int, Field(ge=1, le=32, description="surfaces of glass that a ray may enter")] | None = None
     exposure: Annotated[float, Field(ge=-64.0, le=64.0)] | None = None
     camera_light: bool | None = None
     purposes: Annotated[list[Purpose], Field(min_length=1, max_length=4), _Once] | None = None

@@ -12,7 +12,7 @@ from pathlib import Path
 STAGE = Path(__file__).parent / "warm_stage" / "stage.usda"
 
 
-def draw(screens: tuple[str, ...] = ("march", "proxy")) -> None:
+def draw(screens: tuple[str, ...] = ("traced", "proxy")) -> None:
     """Load all that a job may need. About a minute where kernels are to be compiled, two seconds later.
 
     In a process that has just been forked it takes a tenth of a second, and gives it memory of its own: a job that

@@ -136,7 +136,7 @@ def _serve(descriptor: int) -> int:
     if not select.select([descriptor], [], [], _HURRY)[0]:  # nobody waits for this worker yet
         from . import warm
 
-        warm.draw(("march",))
+        warm.draw(("traced",))
     with os.fdopen(descriptor, "rb", closefd=False) as file:
         line = file.readline()
     if not line:

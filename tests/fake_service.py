@@ -55,7 +55,7 @@ def facts(stage: str) -> dict[str, Any]:
         "metres_per_unit_authored": True,
         "time": {"start": 0.0, "end": 0.0, "authored": False, "frames_per_second": 24.0},
         "prims": {"all": 9, "meshes": 2, "materials": 2, "lights": 1, "instances": 0, "instancers": 0},
-        "settings": {"tiers": ["screen", "probe", "sky"], "max_layers": 4, "samples": 4},
+        "settings": {"tiers": ["screen", "probe", "sky"], "max_layers": 16, "samples": 4},
         "environment": True, "glass": [glass("Ball", "sphere"), glass("Block", "box")], "probes": [], "unsupported": [],
         "cameras": cameras, "suspicious": [odd],
     }  # fmt: skip

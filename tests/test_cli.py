@@ -225,7 +225,7 @@ def test_complexity_is_accepted_and_says_what_it_does_not_do(engine: Engine, tmp
         (["a.png", "-w", "0"], "image_width is 0"),
         (["a.png", "--tiers", "screen,moon"], "moon"),
         (["a.png", "--tiers", ""], "tiers is empty"),
-        (["a.png", "--screen", "guess"], "march, proxy"),
+        (["a.png", "--screen", "guess"], "march, proxy, traced"),
         (["a.png", "--model", "ball"], "sphere"),
         (["a.png", "--exposure", "nan"], "exposure"),
         (["a.png", "--purposes", "all"], "guide"),

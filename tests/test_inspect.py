@@ -180,12 +180,12 @@ def test_layers_of_meshes_count_outer_sides(tmp_path: Path) -> None:
     boxes = "".join(
         CUBE(name=name, extra=f"rel material:binding = </M>\n double3 xformOp:translate = (0, 0, {z})\n"
              'uniform token[] xformOpOrder = ["xformOp:translate"]')
-        for name, z in (("A", 0), ("B", -4), ("C", -8), ("D", -12), ("E", -16))
+        for name, z in ((f"B{k}", -4 * k) for k in range(17))
     )  # fmt: skip
     said = report(tmp_path, CAMERA + boxes + MATERIAL % ("M", "traced", ""))
-    assert {piece["layers"] for piece in said["glass"]} == {5}
+    assert {piece["layers"] for piece in said["glass"]} == {17}
     (entry,) = said["suspicious"]
-    assert (entry["rule"], entry["fix"]) == ("refract.too-many-layers", "render with --max-layers 5")
+    assert (entry["rule"], entry["fix"]) == ("refract.too-many-layers", "render with --max-layers 17")
 
 
 # --- probes and the stage -------------------------------------------------------------------------------------------

@@ -27,7 +27,7 @@ def mixed() -> Scene:
     floor = quad("/floor", [(-2, -1, 2), (2, -1, 2), (2, -1, -2), (-2, -1, -2)], 6)
     cube = box("/cube", (0.4, 0.4, 0.4), 7, turned((1, 1, 0), 30), (-0.4, -0.2, 0.5))
     rough = glass(Model.BOX, ROUGHNESS=0.3, THICKNESS=0.6, TRANSMITTANCE=(0.7, 0.9, 1.0))
-    ball = Sphere("/ball", (0.4, 0.1, -0.3), 0.7, 8)
+    ball = Sphere("/ball", (0.7, 0.2, -0.6), 0.6, 8)
     lamp = light(LightKind.RECT, (0, 2, 0), (0, -1, 0), (1.0, 1.0), 2.0)
     grey = material("/grey", DIFFUSE=0.5, ROUGHNESS=0.4, IOR=1.5)
     return scene(

@@ -72,7 +72,7 @@ TABLE = (
     Attribute(PROBE, "collection:captured:includeRoot", "bool", True, uniform=True),
     Attribute(SETTINGS, "refract:samples", "int", 4, minimum=1, maximum=4096, uniform=True),
     Attribute(SETTINGS, "refract:tiers", "token[]", ("screen", "probe", "ray", "sky"), TIERS, uniform=True),
-    Attribute(SETTINGS, "refract:maxLayers", "int", 4, minimum=1, maximum=32, uniform=True),
+    Attribute(SETTINGS, "refract:maxLayers", "int", 16, minimum=1, maximum=32, uniform=True),
 )
 IDS = [row.name for row in TABLE]
 HOST = {MATERIAL: "Material", PROBE: "Xform", SETTINGS: "RenderSettings"}

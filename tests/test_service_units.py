@@ -54,9 +54,9 @@ def test_the_models_have_the_engines_words() -> None:
     assert get_args(models.Tier) == TIERS
     assert get_args(models.Purpose) == PURPOSES
     assert get_args(models.Aov) == tuple(AOVS)
-    known = {one.name for one in fields(RenderSettings)} - {"jobs", "tile_size"}
+    known = {one.name for one in fields(RenderSettings)} - {"jobs", "tile_size", "cut"}
     assert known <= models.Render.model_fields.keys()
-    assert set(SCREEN_METHODS) == {"march", "proxy"}
+    assert set(SCREEN_METHODS) == {"march", "proxy", "traced"}
 
 
 @pytest.mark.parametrize(

@@ -51,9 +51,9 @@ Tiers = Annotated[
 Screen = Annotated[
     str | None,
     typer.Option(
-        metavar="march|proxy",
-        help="How the screen tier finds its pixel: march follows the ray through the depth buffer (the default), "
-        "proxy does exactly what HDRP does.",
+        metavar="traced|march|proxy",
+        help="How the screen tier finds its pixel: traced sends the ray, and asks whether the picture shows what it "
+        "meets (the default); march follows it through the depth buffer; proxy does exactly what HDRP does.",
     ),
 ]
 ModelName = Annotated[
@@ -75,7 +75,11 @@ Override = Annotated[
     ),
 ]
 MaxLayers = Annotated[
-    int | None, typer.Option(help="Refractive surfaces along one view ray, 1 to 32. The default is 4; 1 is HDRP.")
+    int | None,
+    typer.Option(
+        help="Refractive surfaces that a ray may enter before it sees no more glass, 1 to 32. The default is 16; 1 is "
+        "HDRP."
+    ),
 ]
 Aovs = Annotated[
     str,

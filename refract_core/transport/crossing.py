@@ -27,6 +27,7 @@ from .rays import (
     ALL_CHANNELS,
     MIRRORED_SIDE,
     MOST_MEDIA,
+    OUT_OF_BODY,
     THROUGH_SIDE,
     VIEW,
     Rays,
@@ -155,10 +156,14 @@ def meet(meeting: Meeting, lane: int, now: Rays, at: Interaction, world: World, 
     absorb(now, lane, hit.t)
     meeting.slot[lane], meeting.t[lane] = slot, hit.t
     if kind == PASSED:
+        if now.inner[lane] != 0 and thing == now.thing[lane]:
+            now.inner[lane] = 1 if outer else OUT_OF_BODY
         meeting.kind[lane] = kind
         return
     if kind == ENTERED:
         kind = _enter(meeting, lane, now)
+    if now.inner[lane] == OUT_OF_BODY and (kind == ENTERED or kind == ANSWERED):
+        drop_medium(media, lane, slot_of(media, lane, now.thing[lane]))  # nothing else would ever end it
     elif kind == LEFT and filling(media, lane) != slot:
         drop_medium(media, lane, slot)  # something else fills the space on both sides
         kind = PASSED

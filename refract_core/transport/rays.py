@@ -21,6 +21,8 @@ MOST_MEDIA = 6
 AIR = -1
 """The slot of a medium that is none."""
 ALL_CHANNELS = -1
+OUT_OF_BODY = 2
+"""A ray is on an inner stretch, and behind the wall of the real body."""
 
 # Sides: how a ray came to be.
 VIEW, THROUGH_SIDE, MIRRORED_SIDE = 0, 1, 2
@@ -73,7 +75,7 @@ class Rays(NamedTuple):
     travelled: F64_1D
     """its way from the eye to its origin [m]; what it sees of a texture is as wide as its cone is by then"""
     inner: I32_1D
-    """1 on the inner stretch of a model, from its entry to its exit"""
+    """1 on the inner stretch of a model, from its entry to its exit; OUT_OF_BODY once the wall of the real body is passed"""
     leave_point: F64_2D
     """shape (N, 3): where an inner stretch ends [m]"""
     leave_direction: F64_2D

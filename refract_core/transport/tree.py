@@ -253,9 +253,11 @@ def _trace(scratch: TreeScratch, world: World, rules: Rules, taken: int) -> None
     together = True
     for lane in range(taken):
         met.part[lane] = NOTHING
-        if now.lost[lane] != 0:
-            continue
-        blind = now.media.depth[lane] == 0 and now.entered[lane] >= rules.max_layers
+        if now.lost[lane] != 0:  # as if there were no glass at all
+            now.media.depth[lane] = 0
+            if now.inner[lane] != 0:
+                now.inner[lane], now.end[lane] = 0, math.inf
+        blind = now.media.depth[lane] == 0 and (now.entered[lane] >= rules.max_layers or now.lost[lane] != 0)
         scratch.far[lane] = now.end[lane]
         set_ray(
             packet, lane, row(now.origin, lane), row(now.direction, lane), now.start[lane], now.end[lane],
@@ -303,7 +305,7 @@ def _meet_all(scratch: TreeScratch, world: World, asking: Asking, rules: Rules, 
     for lane in range(taken):
         hit = kept_hit(met, lane)
         if hit.part == NOTHING:
-            if now.inner[lane] != 0 and now.lost[lane] == 0:
+            if now.inner[lane] != 0:
                 absorb(now, lane, now.end[lane])
                 scratch.state[lane] = _PASSED_OUT
             else:

@@ -164,7 +164,7 @@ def _too_deep(seen: Overview, layers: list[int | None]) -> list[Finding]:
     if most <= limit:
         return []
     path = seen.glass[layers.index(most)].path
-    text = f"{most} refractive surfaces lie behind one another, but {limit} are drawn at most"
+    text = f"{most} refractive surfaces lie behind one another, but a ray enters {limit} at most"
     return [Finding("refract.too-many-layers", WARNING, path, text, f"render with --max-layers {min(most, 32)}")]
 
 
@@ -263,7 +263,7 @@ def _head(report: Report) -> list[str]:
         f"prims       {', '.join(counted)}",
         f"cameras     {', '.join(cameras[:3]) + more if cameras else 'none; one that frames everything is used'}",
         f"lights      {prims['lights'] or 'none'}, {sky}",
-        f"settings    tiers {','.join(settings['tiers'])}; {settings['max_layers']} layers at most",
+        f"settings    tiers {','.join(settings['tiers'])}; {settings['max_layers']} surfaces entered at most",
     ]
 
 

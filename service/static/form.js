@@ -47,7 +47,7 @@ const copyOf = (settings) => structuredClone(settings);
 
 const PRESETS = {
   model: [{ model: "sphere" }, { model: "traced" }],
-  screen: [{ screen: "march" }, { screen: "proxy" }],
+  screen: [{ screen: "traced" }, { screen: "proxy" }],
   tiers: [{ tiers: ["screen", "probe", "ray", "sky"] }, { tiers: ["ray", "sky"] }],
   layers: [{}, { max_layers: 1 }],
 };

@@ -10,8 +10,8 @@ export function defaultSettings(facts) {
   const authored = facts?.settings ?? {};
   return {
     camera: "", time_code: null, image_width: 480, image_height: 0, samples: authored.samples ?? 4, exposure: 0,
-    tiers: [...(authored.tiers ?? ["screen", "probe", "ray", "sky"])], screen: "march", model: "",
-    max_layers: authored.max_layers ?? 4, overrides: {},
+    tiers: [...(authored.tiers ?? ["screen", "probe", "ray", "sky"])], screen: "traced", model: "",
+    max_layers: authored.max_layers ?? 16, overrides: {},
   };
 }
 

@@ -87,8 +87,8 @@ def thickness_at(scene: Scene, hit: Hit, model: Model) -> float:
 
 
 def media_around(shader: Shader, eye: Vec, override: str) -> Media:
-    """Closed traced bodies that the eye is in, the largest first. Each has the attributes of the nearest place where one
-    of the eight rays leaves it."""
+    """Closed traced bodies that the eye is in, the largest first. Each has the attributes of the nearest place where
+    one of the eight rays leaves it."""
     scene = shader.scene
     votes: dict[int, int] = {}
     exits: dict[int, Hit] = {}

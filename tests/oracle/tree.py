@@ -450,8 +450,8 @@ def _only(channel: int) -> Vec:
 
 
 def _beside(ray: Ray, s: Surface) -> Ray:
-    """It does not start on the surface, but a little to the side it goes to. What runs round in a ball doubles such a step
-    at each reflection, so this is part of where it comes to."""
+    """It does not start on the surface, but a little to the side it goes to. What runs round in a ball doubles such a
+    step at each reflection, so this is part of where it comes to."""
     step = math.copysign(_BESIDE[0] * max(abs(c) for c in s.point) + _BESIDE[1], dot(s.ng, ray.direction))
     return ray._replace(origin=add(s.point, scaled(s.ng, step)))
 

@@ -204,9 +204,6 @@ def _refraction(context: Context, material: UsdShade.Material, surface: Surface,
         note(context, f"inputs:refraction:abbeNumber is {abbe}; the valid range is at least 0; 0 (none) is used")
     attribute = material.GetPrim().GetAttribute("refraction:priority")
     priority = int((attribute.Get() if attribute else None) or 0)
-    if priority:
-        note(context, f"refraction:priority is {priority}, which does nothing yet: where media overlap, the one that a "
-             "ray entered first goes on to its own far side; model the media without overlap")  # fmt: skip
     return _with(
         row,
         changes,
