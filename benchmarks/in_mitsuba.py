@@ -4,7 +4,7 @@ Both rooms are drawn by short integrators of Mitsuba's parts, written here, that
 to the first surface that is not. In the emissive room that is all. In the lit one the surface is lit directly: by one
 sample of the lamp or the sky and one of the surface, weighted (Veach's power heuristic), so that matt surfaces do not
 light each other, which would hide everything else that differs between two renderers. `Light` says what glass does to
-light on its way to that surface. Mitsuba's own `path` finds the same in the emissive room (`tests/test_benchmarks.py`), but
+light on its way to that surface. Mitsuba's own `path` finds the same in the emissive room (`tests/test_peers.py`), but
 does more work for it: these integrators look for nothing that is not there. A scalar variant has `path` alone.
 
 Nothing here is imported before `library` is called: Mitsuba is an extra.
@@ -13,6 +13,9 @@ Nothing here is imported before `library` is called: Mitsuba is an extra.
 from __future__ import annotations
 
 import importlib
+import random
+import subprocess
+import sys
 from enum import StrEnum
 from typing import Any, NamedTuple
 
@@ -43,8 +46,8 @@ class Loaded(NamedTuple):
     mi: Any
     scene: Any
     integrators: dict[Light, Any]
-    share: Any
-    """an integrator whose picture is the share of a pixel in which glass is met first"""
+    silhouette: Any
+    """the same scene, in which glass is white and all else black"""
 
 
 def library(variant: str = "llvm_ad_rgb", jobs: int = 0) -> Any:
@@ -55,17 +58,30 @@ def library(variant: str = "llvm_ad_rgb", jobs: int = 0) -> Any:
     """
     try:
         mi = importlib.import_module("mitsuba")
-        dr = importlib.import_module("drjit")
     except ImportError as error:
         raise UsageError("this benchmark needs the package 'mitsuba'; pip install 'usd-refract[bench]'") from error
-    try:
-        mi.set_variant(variant)
-        dr.eval(dr.arange(mi.Float, 2) + 1.0 if "llvm" in variant else mi.Float(1.0))
-    except (ImportError, AttributeError, RuntimeError) as error:
-        raise UsageError(f"Mitsuba's variant '{variant}' does not work here: {error}") from error
+    if variant not in mi.variants():
+        raise UsageError(f"Mitsuba has no variant '{variant}'; choose from {', '.join(mi.variants())}")
+    if variant.startswith("llvm"):
+        _try_llvm(variant)
+    mi.set_variant(variant)
     if jobs:
-        dr.set_thread_count(jobs)
+        importlib.import_module("drjit").set_thread_count(jobs)
     return mi
+
+
+def _try_llvm(variant: str) -> None:
+    """Compile one line in a process of its own: an LLVM that is too old for it ends the process.
+
+    Raises:
+        UsageError: it did.
+    """
+    # A number that no kernel was ever made for, lest one be found on disk.
+    line = f"drjit.eval(drjit.maximum(drjit.arange(mitsuba.Float, 3), {random.random()}))"
+    code = f"import mitsuba, drjit; mitsuba.set_variant('{variant}'); {line}"
+    if subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode != 0:
+        hint = "set DRJIT_LIBLLVM_PATH to the libLLVM.so of a newer one (19 does)"
+        raise UsageError(f"Mitsuba's variant '{variant}' finds no LLVM here that can compile its code; {hint}")
 
 
 def load(mi: Any, room: Room, width: int) -> Loaded:
@@ -74,17 +90,15 @@ def load(mi: Any, room: Room, width: int) -> Loaded:
     Raises:
         UsageError: the room has a lamp, and the variant is a scalar one, for which integrators are C++ alone.
     """
-    scalar = mi.variant().startswith("scalar")
-    if room.lamp is not None and scalar:
-        raise UsageError(f"the {room.name} room needs an llvm variant of Mitsuba, not {mi.variant()}; install LLVM")
-    scene = mi.load_dict(_scene(mi, room, room.solids, width))
-    share = mi.load_dict({"type": "path", "max_depth": 2}) if scalar else _glass_share(mi)
+    if room.lamp is not None and _is_scalar(mi):
+        raise UsageError(f"the {room.name} room needs an llvm variant of Mitsuba, not {mi.variant()}")
+    scene, silhouette = (mi.load_dict(_scene(mi, of, of.solids, width)) for of in (room, _silhouette(room)))
     if room.lamp is None:
-        return Loaded(mi, scene, dict.fromkeys(Light, _path(mi) if scalar else _through_glass(mi)), share)
+        return Loaded(mi, scene, dict.fromkeys(Light, _shining(mi)), silhouette)
     without = tuple(solid for solid in room.solids if not solid.finish.glass)
     opaque = mi.load_dict(_scene(mi, room, without, width))
     integrators = {Light.STRAIGHT: _once_lit(mi, opaque), Light.WORLD: _once_lit(mi, None)}
-    return Loaded(mi, scene, integrators, share)
+    return Loaded(mi, scene, integrators, silhouette)
 
 
 def draw(loaded: Loaded, light: Light, samples: int, seed: int) -> F32:
@@ -95,7 +109,19 @@ def draw(loaded: Loaded, light: Light, samples: int, seed: int) -> F32:
 
 def glass_share(loaded: Loaded, samples: int) -> F32:
     """Share of every pixel in which glass is met first, shape (H, W)."""
-    return np.array(loaded.mi.render(loaded.scene, integrator=loaded.share, spp=samples, seed=1), np.float32)[..., 0]
+    mi = loaded.mi
+    image = mi.render(loaded.silhouette, integrator=_shining(mi), spp=samples, seed=1)
+    return np.array(image, np.float32)[..., 0]
+
+
+def _silhouette(room: Room) -> Room:
+    white, black = Finish(radiance=(1.0, 1.0, 1.0)), Finish(albedo=(0.0, 0.0, 0.0))
+    solids = tuple(solid._replace(finish=white if solid.finish.glass else black) for solid in room.solids)
+    return room._replace(solids=solids, lamp=None, sky=(0.0, 0.0, 0.0))
+
+
+def _is_scalar(mi: Any) -> bool:
+    return bool(mi.variant().startswith("scalar"))
 
 
 # ------------------------------------------------------------------------------------------------ the scene
@@ -168,7 +194,7 @@ def _colour(rgb: tuple[float, float, float]) -> dict[str, Any]:
 
 
 def _lamp(mi: Any, lamp: Lamp) -> dict[str, Any]:
-    """Mitsuba's rectangle reaches from -1 to 1 and shines along its +Z, ours along -Z: the second axis is turned too."""
+    """Mitsuba's rectangle reaches from -1 to 1 and shines along +Z, ours along -Z: the second axis is turned too."""
     m = lamp.world_from_lamp.copy()
     m[:3, 0] *= lamp.size[0] / 2.0
     m[:3, 1] *= -lamp.size[1] / 2.0
@@ -181,19 +207,13 @@ def _lamp(mi: Any, lamp: Lamp) -> dict[str, Any]:
 # ------------------------------------------------------------------------------------------------ integrators
 
 
-def _glass_share(mi: Any) -> Any:
-    """1 where a ray of the eye meets glass first."""
-
-    class GlassShare(mi.SamplingIntegrator):  # type: ignore[misc]
-        def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> Any:
-            si = scene.ray_intersect(ray, active)
-            glass = active & si.is_valid() & mi.has_flag(si.bsdf(ray).flags(), mi.BSDFFlags.DeltaTransmission)
-            return mi.Color3f(importlib.import_module("drjit").select(glass, 1.0, 0.0)), si.is_valid(), []
-
-    return GlassShare(mi.Properties())
+def _shining(mi: Any) -> Any:
+    """An integrator for what shines by itself. In scalar variants Python's own would be far too slow."""
+    return path(mi) if _is_scalar(mi) else _through_glass(mi)
 
 
-def _path(mi: Any) -> Any:
+def path(mi: Any) -> Any:
+    """Mitsuba's own integrator, without Russian roulette."""
     return mi.load_dict({"type": "path", "max_depth": DEPTH, "rr_depth": 2 * DEPTH})
 
 
@@ -283,7 +303,8 @@ def _once_lit(mi: Any, opaque: Any | None) -> Any:
             end, weight, met, _ = _follow(mi, where, sampler, ray, active)
             emitter = end.emitter(where, active)
             to = mi.DirectionSample3f(where, end, si)
-            pdf = where.pdf_emitter_direction(si, to, active & ~met & (emitter != None))  # noqa: E711 - of a pointer array
+            some = emitter != None  # noqa: E711 - an array of pointers
+            pdf = where.pdf_emitter_direction(si, to, active & ~met & some)
             share = dr.select(met, 1.0, power(sample.pdf, pdf))
             return dr.select(active, value * weight * emitter.eval(end, active) * share, 0.0)
 

@@ -91,4 +91,4 @@ def _light(lamp: Lamp) -> Light:
 
 
 def _environment(sky: tuple[float, float, float]) -> Environment:
-    return Environment(np.broadcast_to(np.float32(sky), (16, 32, 3)).copy())
+    return Environment(np.full((16, 32, 3), sky, np.float32))

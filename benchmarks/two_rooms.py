@@ -1,13 +1,14 @@
 """Two rooms as plain numbers, for any renderer: meshes, finishes, a lamp, a sky and an eye.
 
-`emissive_room`: a closed, checkered room in which every opaque surface shines by itself and nothing is lit, with a ball,
-a torus, a blob, a hollow ball, a slab and a pane of glass. So what differs between two pictures of it is refraction alone.
+`emissive_room`: a closed, checkered room in which every opaque surface shines by itself and nothing is lit, with a
+ball, a torus, a blob, a hollow ball, a slab and a pane of glass. What differs between two pictures of it is refraction
+alone.
 
 `lit_room`: a textured floor and wall, a lamp of one square metre and an even sky, with a ball, a cube, a torus and a
 hollow ball of glass and an opaque ball.
 
-Everything is in metres, right-handed, Y up. Triangles are counter-clockwise from outside; opaque surfaces shine, and are
-lit, on that side. All glass is closed, clear and smooth, of one index, and no two things touch.
+Everything is in metres, right-handed, Y up. Triangles are counter-clockwise from outside; opaque surfaces shine, and
+are lit, on that side. All glass is closed, clear and smooth, of one index, and touches nothing.
 """
 
 from __future__ import annotations
@@ -108,7 +109,7 @@ GLASS = Finish(glass=True)
 
 
 def place(centre: ArrayLike, yaw: float = 0.0, pitch: float = 0.0) -> F64:
-    """Where a thing stands: turned by `pitch` about x, then by `yaw` about y [degrees], then moved [m]. Shape (4, 4)."""
+    """Where a thing stands: turned by `pitch` about x, by `yaw` about y [degrees], then moved [m]; shape (4, 4)."""
     a, b = np.radians([yaw, pitch])
     about_y = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
     about_x = np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
