@@ -113,8 +113,7 @@ def _grid(axes: _Axes) -> list[str]:
     for five in range(2 * axes.tens[0], 2 * axes.tens[1] + 1):
         parts += [_line(left, axes.y(5.0 * five), right, axes.y(5.0 * five))]
         parts += [_text(left - 8, axes.y(5.0 * five) + 4, f"{5 * five}", anchor="end")]
-    parts.append(_text((left + right) / 2, bottom + 42, "seconds", 13, anchor="middle"))
-    return [*parts, _text(12, 28, "PSNR, dB", 13)]
+    return [*parts, _text((left + right) / 2, bottom + 42, "seconds", 13, anchor="middle")]
 
 
 def _drawn(axes: _Axes, curve: list[Point], ink: str) -> list[str]:
