@@ -38,6 +38,8 @@ class Light(StrEnum):
     glass. That is the engine's model."""
     WORLD = "world"
     """All it does: shadows, caustics, the lamp through glass. Only matt surfaces still do not light each other."""
+    PATH = "path"
+    """The same, and matt surfaces light each other: Mitsuba's own `path`, as anybody would use it."""
 
 
 class Loaded(NamedTuple):
@@ -97,7 +99,7 @@ def load(mi: Any, room: Room, width: int) -> Loaded:
         return Loaded(mi, scene, dict.fromkeys(Light, _shining(mi)), silhouette)
     without = tuple(solid for solid in room.solids if not solid.finish.glass)
     opaque = mi.load_dict(_scene(mi, room, without, width))
-    integrators = {Light.STRAIGHT: _once_lit(mi, opaque), Light.WORLD: _once_lit(mi, None)}
+    integrators = {Light.STRAIGHT: _once_lit(mi, opaque), Light.WORLD: _once_lit(mi, None), Light.PATH: path(mi)}
     return Loaded(mi, scene, integrators, silhouette)
 
 

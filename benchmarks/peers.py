@@ -17,7 +17,8 @@ In the lit room matt surfaces do not light each other, in either program (`bench
 compared with a truth in which light goes straight through glass to what it lights, and the lamp itself is seen in the
 outside of glass alone, for that is what the engine means to draw; Mitsuba draws just that too, with less noise than it
 would have with caustics. What is left out so is measured once: the rows "all glass does" hold our best picture, and
-that truth, against a truth with everything that glass does to light.
+that truth, against a truth with everything that glass does to light. "Mitsuba path" is Mitsuba as anybody would use it,
+with caustics and light between surfaces, against its own converged picture.
 
 Seconds are the median of the repeats, after a first time that is not counted, both programs by turns on all cores. Ours
 build the scene's tables and its hierarchy in every frame; Mitsuba's scene is loaded before, but it goes through its
@@ -50,7 +51,7 @@ from .in_refract import scene_of
 from .truth import Truth, converged
 from .two_rooms import ROOMS, Room
 
-OURS, THEIRS = "refract", "Mitsuba"
+OURS, THEIRS, PATH = "refract", "Mitsuba", "Mitsuba path"
 LEVELS: dict[str, dict[str, Any]] = {
     "1 sample": {"samples": 1},
     "4 samples": {"samples": 4},
@@ -73,6 +74,8 @@ class Entrant(NamedTuple):
     name: str
     picture: Callable[[int], F32]
     """turn -> shape (H, W, 3), linear. Where there is noise it is another one in every turn."""
+    truth: Picture
+    """What it would be with samples without end, shape (H, W, 3), linear"""
 
 
 class Run(NamedTuple):
@@ -125,9 +128,9 @@ def ours(room: Room, options: Options, level: dict[str, Any]) -> Callable[[int],
     return picture
 
 
-def theirs(loaded: Loaded, samples: int) -> Callable[[int], F32]:
+def theirs(loaded: Loaded, samples: int, light: Light = Light.STRAIGHT) -> Callable[[int], F32]:
     """Draws a loaded room with another seed in every turn."""
-    return partial(draw, loaded, Light.STRAIGHT, samples)
+    return partial(draw, loaded, light, samples)
 
 
 def regions_of(share: F32, straight: F64, world: F64 | None) -> dict[str, Mask]:
@@ -153,7 +156,7 @@ def scores(linear: Picture, truth: Picture, regions: dict[str, Mask]) -> dict[st
     return {name: psnr(*pair, mask) if mask.any() else math.nan for name, mask in regions.items()}
 
 
-def race(entrants: Sequence[Entrant], truth: Picture, regions: dict[str, Mask], repeat: int) -> list[Run]:
+def race(entrants: Sequence[Entrant], regions: dict[str, Mask], repeat: int) -> list[Run]:
     """Let all draw by turns. The first turn compiles, and is not counted; who has drawn long enough drops out."""
     times: list[list[float]] = [[] for _ in entrants]
     errors: list[list[dict[str, float]]] = [[] for _ in entrants]
@@ -165,7 +168,7 @@ def race(entrants: Sequence[Entrant], truth: Picture, regions: dict[str, Mask], 
             picture = entrant.picture(turn)
             if turn > 0:
                 times[k].append(time.perf_counter() - start)
-                errors[k].append(scores(picture, truth, regions))
+                errors[k].append(scores(picture, entrant.truth, regions))
     return [
         Run(entrant.program, entrant.name, statistics.median(took), _medians(found))
         for entrant, took, found in zip(entrants, times, errors, strict=True)
@@ -190,14 +193,18 @@ def measure(mi: Any, room: Room, options: Options) -> Measured:
         UsageError: this variant of Mitsuba cannot draw the room.
     """
     loaded = load(mi, room, options.size)
-    truth = converged(room, Light.STRAIGHT, loaded, options.reference_samples, options.cache, _tell)
-    world = None
-    if room.lamp is not None:
-        world = converged(room, Light.WORLD, loaded, options.reference_samples, options.cache, _tell)
+    wanted = tuple(Light) if room.lamp is not None else (Light.STRAIGHT,)
+    truths = {
+        light: converged(room, light, loaded, options.reference_samples, options.cache, _tell) for light in wanted
+    }
+    truth, world = truths[Light.STRAIGHT], truths.get(Light.WORLD)
     regions = regions_of(truth.share, truth.linear, None if world is None else world.linear)
-    entrants = [Entrant(OURS, name, ours(room, options, LEVELS[name])) for name in options.levels]
-    entrants += [Entrant(THEIRS, f"{n} spp", theirs(loaded, n)) for n in options.mitsuba]
-    runs = race(entrants, truth.linear, regions, options.repeat)
+    entrants = [Entrant(OURS, name, ours(room, options, LEVELS[name]), truth.linear) for name in options.levels]
+    for program, light in ((THEIRS, Light.STRAIGHT), (PATH, Light.PATH)):
+        if light in truths:
+            own = truths[light].linear
+            entrants += [Entrant(program, f"{n} spp", theirs(loaded, n, light), own) for n in options.mitsuba]
+    runs = race(entrants, regions, options.repeat)
     picture, seconds = _timed(ours(room, options, BEST[1]))
     best = Run(OURS, f"{BEST[0]} (best)", seconds, scores(picture, truth.linear, regions))
     tiny = options._replace(size=16)
@@ -250,11 +257,13 @@ def ratios(found: Measured) -> list[str]:
     """Lines: how many times faster ours are, by region and error."""
     lines = [f"{'times faster, to reach dB':<28}" + "".join(f"{decibels:>8}" for decibels in DECIBELS)]
     for region in found.regions:
-        curves = curves_of(found.runs, region)
-        pairs = [(needed(curves[OURS], d), needed(curves[THEIRS], d)) for d in DECIBELS]
-        lines.append(f"{region:<28}" + "".join(f"{times_faster(*pair):>8}" for pair in pairs))
-        for name, which in ((OURS, 0), (THEIRS, 1)):
-            lines.append(f"  {name + ', seconds':<26}" + "".join(f"{_seconds(pair[which]):>8}" for pair in pairs))
+        times = {name: [needed(curve, d) for d in DECIBELS] for name, curve in curves_of(found.runs, region).items()}
+        for name, their in times.items():
+            if name != OURS:
+                pairs = zip(times[OURS], their, strict=True)
+                lines.append(f"{region + ', than ' + name:<28}" + "".join(f"{times_faster(*p):>8}" for p in pairs))
+        for name, seconds in times.items():
+            lines.append(f"  {name + ', seconds':<26}" + "".join(f"{_seconds(one):>8}" for one in seconds))
     return lines
 
 
