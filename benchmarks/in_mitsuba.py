@@ -1,0 +1,313 @@
+"""A room of `two_rooms` as a scene of Mitsuba 3, and its pictures by path tracing.
+
+Both rooms are drawn by short integrators of Mitsuba's parts, written here, that follow light from the eye through glass
+to the first surface that is not. In the emissive room that is all. In the lit one the surface is lit directly: by one
+sample of the lamp or the sky and one of the surface, weighted (Veach's power heuristic), so that matt surfaces do not
+light each other, which would hide everything else that differs between two renderers. `Light` says what glass does to
+light on its way to that surface. Mitsuba's own `path` finds the same in the emissive room (`tests/test_peers.py`), but
+does more work for it: these integrators look for nothing that is not there. A scalar variant has `path` alone.
+
+Nothing here is imported before `library` is called: Mitsuba is an extra.
+"""
+
+from __future__ import annotations
+
+import importlib
+import random
+import subprocess
+import sys
+from enum import StrEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from refract_core.errors import UsageError
+from refract_core.scene import F32
+
+from .two_rooms import IOR, Eye, Finish, Glow, Lamp, Room, Solid
+
+DEPTH = 64
+"""Interfaces that a path may meet."""
+
+
+class Light(StrEnum):
+    """What glass does to light from the lamp and the sky. In a room without a lamp all are the same."""
+
+    STRAIGHT = "straight"
+    """Nothing: glass casts no shadow and no caustic, and the lamp is seen only as the highlight on the outside of
+    glass. That is the engine's model."""
+    WORLD = "world"
+    """All it does: shadows, caustics, the lamp through glass. Only matt surfaces still do not light each other."""
+    PATH = "path"
+    """The same, and matt surfaces light each other: Mitsuba's own `path`, as anybody would use it."""
+
+
+class Loaded(NamedTuple):
+    """A room in Mitsuba, ready to be drawn."""
+
+    mi: Any
+    scene: Any
+    integrators: dict[Light, Any]
+    silhouette: Any
+    """the same scene, in which glass is white and all else black"""
+
+
+def library(variant: str = "llvm_ad_rgb", jobs: int = 0) -> Any:
+    """Mitsuba in one of its variants, on `jobs` threads (0: all cores).
+
+    Raises:
+        UsageError: it is not installed, or the variant does not work here.
+    """
+    try:
+        mi = importlib.import_module("mitsuba")
+    except ImportError as error:
+        raise UsageError("this benchmark needs the package 'mitsuba'; pip install 'usd-refract[bench]'") from error
+    if variant not in mi.variants():
+        raise UsageError(f"Mitsuba has no variant '{variant}'; choose from {', '.join(mi.variants())}")
+    if variant.startswith("llvm"):
+        _try_llvm(variant)
+    mi.set_variant(variant)
+    if jobs:
+        importlib.import_module("drjit").set_thread_count(jobs)
+    return mi
+
+
+def _try_llvm(variant: str) -> None:
+    """Compile one line in a process of its own: an LLVM that is too old for it ends the process.
+
+    Raises:
+        UsageError: it did.
+    """
+    # A number that no kernel was ever made for, lest one be found on disk.
+    line = f"drjit.eval(drjit.maximum(drjit.arange(mitsuba.Float, 3), {random.random()}))"
+    code = f"import mitsuba, drjit; mitsuba.set_variant('{variant}'); {line}"
+    if subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode != 0:
+        hint = "set DRJIT_LIBLLVM_PATH to the libLLVM.so of a newer one (19 does)"
+        raise UsageError(f"Mitsuba's variant '{variant}' finds no LLVM here that can compile its code; {hint}")
+
+
+def load(mi: Any, room: Room, width: int) -> Loaded:
+    """Hand a room to Mitsuba. `width`: of its pictures [pixels]; 16:9.
+
+    Raises:
+        UsageError: the room has a lamp, and the variant is a scalar one, for which integrators are C++ alone.
+    """
+    if room.lamp is not None and _is_scalar(mi):
+        raise UsageError(f"the {room.name} room needs an llvm variant of Mitsuba, not {mi.variant()}")
+    scene, silhouette = (mi.load_dict(_scene(mi, of, of.solids, width)) for of in (room, _silhouette(room)))
+    if room.lamp is None:
+        return Loaded(mi, scene, dict.fromkeys(Light, _shining(mi)), silhouette)
+    without = tuple(solid for solid in room.solids if not solid.finish.glass)
+    opaque = mi.load_dict(_scene(mi, room, without, width))
+    integrators = {Light.STRAIGHT: _once_lit(mi, opaque), Light.WORLD: _once_lit(mi, None), Light.PATH: path(mi)}
+    return Loaded(mi, scene, integrators, silhouette)
+
+
+def draw(loaded: Loaded, light: Light, samples: int, seed: int) -> F32:
+    """A picture, shape (H, W, 3), linear. `samples`: a square, for the sampler is stratified."""
+    image = loaded.mi.render(loaded.scene, integrator=loaded.integrators[light], spp=samples, seed=seed)
+    return np.array(image, np.float32)
+
+
+def glass_share(loaded: Loaded, samples: int) -> F32:
+    """Share of every pixel in which glass is met first, shape (H, W)."""
+    mi = loaded.mi
+    image = mi.render(loaded.silhouette, integrator=_shining(mi), spp=samples, seed=1)
+    return np.array(image, np.float32)[..., 0]
+
+
+def _silhouette(room: Room) -> Room:
+    white, black = Finish(radiance=(1.0, 1.0, 1.0)), Finish(albedo=(0.0, 0.0, 0.0))
+    solids = tuple(solid._replace(finish=white if solid.finish.glass else black) for solid in room.solids)
+    return room._replace(solids=solids, lamp=None, sky=(0.0, 0.0, 0.0))
+
+
+def _is_scalar(mi: Any) -> bool:
+    return bool(mi.variant().startswith("scalar"))
+
+
+# ------------------------------------------------------------------------------------------------ the scene
+
+
+def _scene(mi: Any, room: Room, solids: tuple[Solid, ...], width: int) -> dict[str, Any]:
+    scene: dict[str, Any] = {"type": "scene", "sensor": _sensor(mi, room.eye, width)}
+    scene |= {solid.name: _mesh(mi, solid, room) for solid in solids}
+    if room.lamp is not None:
+        scene["lamp"] = _lamp(mi, room.lamp)
+    if any(room.sky):
+        scene["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": list(room.sky)}}
+    return scene
+
+
+def _sensor(mi: Any, eye: Eye, width: int) -> dict[str, Any]:
+    """The box filter makes a pixel the mean over its own square, as ours is."""
+    return {
+        "type": "perspective",
+        "fov": float(2.0 * np.degrees(np.arctan(eye.half_height))),
+        "fov_axis": "y",
+        "to_world": mi.ScalarTransform4f().look_at(origin=list(eye.place), target=list(eye.target), up=[0, 1, 0]),
+        "film": {
+            "type": "hdrfilm", "width": width, "height": width * 9 // 16, "pixel_format": "rgb",
+            "component_format": "float32", "sample_border": False, "rfilter": {"type": "box"},
+        },
+        "sampler": {"type": "multijitter", "sample_count": 1},
+    }  # fmt: skip
+
+
+def _mesh(mi: Any, solid: Solid, room: Room) -> Any:
+    found = mi.Properties()
+    found["bsdf"] = mi.load_dict(_bsdf(mi, solid.finish, room))
+    if solid.finish.radiance is not None:
+        found["emitter"] = mi.load_dict({"type": "area", "radiance": _glow(mi, solid.finish.radiance, room)})
+    mesh = mi.Mesh(
+        solid.name, len(solid.points), len(solid.triangles), has_vertex_normals=solid.normals is not None,
+        has_vertex_texcoords=solid.st is not None, props=found,
+    )  # fmt: skip
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = solid.points.ravel()
+    parameters["faces"] = solid.triangles.ravel()
+    if solid.normals is not None:
+        parameters["vertex_normals"] = solid.normals.ravel()
+    if solid.st is not None:
+        parameters["vertex_texcoords"] = solid.st.ravel()
+    parameters.update()
+    return mesh
+
+
+def _bsdf(mi: Any, finish: Finish, room: Room) -> dict[str, Any]:
+    if finish.glass:
+        return {"type": "dielectric", "int_ior": IOR, "ext_ior": 1.0}
+    if finish.radiance is not None:
+        return {"type": "conductor", "material": "none", "specular_reflectance": _colour((0.0, 0.0, 0.0))}
+    assert finish.albedo is not None
+    return {"type": "twosided", "matt": {"type": "diffuse", "reflectance": _glow(mi, finish.albedo, room)}}
+
+
+def _glow(mi: Any, glow: Glow, room: Room) -> dict[str, Any]:
+    if not isinstance(glow, str):
+        return _colour(glow)
+    # A bitmap's first row lies at v = 0 here.
+    bitmap = mi.Bitmap(np.ascontiguousarray(room.images[glow][::-1]))
+    return {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "bilinear", "wrap_mode": "repeat"}
+
+
+def _colour(rgb: tuple[float, float, float]) -> dict[str, Any]:
+    return {"type": "rgb", "value": list(rgb)}
+
+
+def _lamp(mi: Any, lamp: Lamp) -> dict[str, Any]:
+    """Mitsuba's rectangle reaches from -1 to 1 and shines along +Z, ours along -Z: the second axis is turned too."""
+    m = lamp.world_from_lamp.copy()
+    m[:3, 0] *= lamp.size[0] / 2.0
+    m[:3, 1] *= -lamp.size[1] / 2.0
+    m[:3, 2] *= -1.0
+    black = {"type": "diffuse", "reflectance": _colour((0.0, 0.0, 0.0))}
+    emitter = {"type": "area", "radiance": _colour(lamp.radiance)}
+    return {"type": "rectangle", "to_world": mi.ScalarTransform4f(m), "bsdf": black, "emitter": emitter}
+
+
+# ------------------------------------------------------------------------------------------------ integrators
+
+
+def _shining(mi: Any) -> Any:
+    """An integrator for what shines by itself. In scalar variants Python's own would be far too slow."""
+    return path(mi) if _is_scalar(mi) else _through_glass(mi)
+
+
+def path(mi: Any) -> Any:
+    """Mitsuba's own integrator, without Russian roulette."""
+    return mi.load_dict({"type": "path", "max_depth": DEPTH, "rr_depth": 2 * DEPTH})
+
+
+def _follow(mi: Any, scene: Any, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any, Any, Any]:
+    """Through glass, one branch at every interface, to what is not glass.
+
+    Returns what is met, the weight, whether glass was met, and whether the last of it was its outside, mirroring.
+    """
+    dr = importlib.import_module("drjit")
+
+    def goes_on(hit: Any, live: Any) -> Any:
+        found = live & hit.is_valid()
+        return found & mi.has_flag(hit.shape.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)
+
+    def step(hit: Any, ray: Any, weight: Any, met: Any, outside: Any, depth: Any, live: Any, sampler: Any) -> Any:
+        si = hit.compute_surface_interaction(ray, active=live)
+        sample, factor = si.bsdf().sample(mi.BSDFContext(), si, sampler.next_1d(live), sampler.next_2d(live), live)
+        outside = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DeltaReflection) & (mi.Frame3f.cos_theta(si.wi) > 0.0)
+        ray = si.spawn_ray(si.to_world(sample.wo))
+        hit = scene.ray_intersect_preliminary(ray, active=live)
+        depth = depth + 1
+        weight = dr.select(depth < DEPTH, weight * factor, 0.0)
+        live = live & (depth < DEPTH) & goes_on(hit, live)
+        return hit, ray, weight, mi.Bool(True), outside, depth, live, sampler
+
+    hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+    state = (
+        hit, mi.Ray3f(ray), mi.Spectrum(1.0), mi.Bool(False), mi.Bool(False), mi.UInt32(0), goes_on(hit, active),
+        sampler,
+    )  # fmt: skip
+    hit, ray, weight, met, outside, *_ = dr.while_loop(state, lambda *s: s[6], step)
+    return hit.compute_surface_interaction(ray, active=active), weight, met, outside
+
+
+def _through_glass(mi: Any) -> Any:
+    """What shines behind any glass."""
+
+    class ThroughGlass(mi.SamplingIntegrator):  # type: ignore[misc]
+        def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> Any:
+            si, weight, _, _ = _follow(mi, scene, sampler, ray, active)
+            return weight * si.emitter(scene, active).eval(si, active), active & si.is_valid(), []
+
+    return ThroughGlass(mi.Properties())
+
+
+def _once_lit(mi: Any, opaque: Any | None) -> Any:
+    """An integrator that lights the first matt surface behind any glass.
+
+    Args:
+        opaque: the scene without glass, in which light is looked for (`Light.STRAIGHT`); None: the scene itself.
+    """
+    dr = importlib.import_module("drjit")
+
+    def power(a: Any, b: Any) -> Any:
+        return dr.select(a > 0.0, a * a / (a * a + b * b), 0.0)
+
+    class OnceLit(mi.SamplingIntegrator):  # type: ignore[misc]
+        def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> Any:
+            si, weight, _, outside = _follow(mi, scene, sampler, ray, active)
+            light = self.seen(scene, si, outside, active)
+            surface = active & si.is_valid()
+            light += self.by_lamp(scene, sampler, si, surface) + self.by_chance(scene, sampler, si, surface)
+            return weight * light, active & si.is_valid(), []
+
+        def seen(self, scene: Any, si: Any, outside: Any, active: Any) -> Any:
+            """What shines by itself: the sky; the lamp where it counts."""
+            emitter = si.emitter(scene, active)
+            counts = active & (~si.is_valid() | outside) if opaque is not None else active
+            return emitter.eval(si, counts)
+
+        def by_lamp(self, scene: Any, sampler: Any, si: Any, active: Any) -> Any:
+            """A sample of the lamp or the sky."""
+            where = scene if opaque is None else opaque
+            to, light = where.sample_emitter_direction(si, sampler.next_2d(active), False, active)
+            active = active & (to.pdf > 0.0) & ~where.ray_test(si.spawn_ray_to(to.p), active=active)
+            value, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(to.d), active)
+            return dr.select(active, value * light * power(to.pdf, pdf), 0.0)
+
+        def by_chance(self, scene: Any, sampler: Any, si: Any, active: Any) -> Any:
+            """A sample of the matt surface; behind glass it alone can find the light."""
+            sample, value = si.bsdf().sample(
+                mi.BSDFContext(), si, sampler.next_1d(active), sampler.next_2d(active), active
+            )
+            ray = si.spawn_ray(si.to_world(sample.wo))
+            active = active & (sample.pdf > 0.0)
+            where = scene if opaque is None else opaque
+            end, weight, met, _ = _follow(mi, where, sampler, ray, active)
+            emitter = end.emitter(where, active)
+            to = mi.DirectionSample3f(where, end, si)
+            some = emitter != None  # noqa: E711 - an array of pointers
+            pdf = where.pdf_emitter_direction(si, to, active & ~met & some)
+            share = dr.select(met, 1.0, power(sample.pdf, pdf))
+            return dr.select(active, value * weight * emitter.eval(end, active) * share, 0.0)
+
+    return OnceLit(mi.Properties())
