@@ -75,7 +75,7 @@ class Rays(NamedTuple):
     travelled: F64_1D
     """its way from the eye to its origin [m]; what it sees of a texture is as wide as its cone is by then"""
     inner: I32_1D
-    """1 on the inner stretch of a model, from its entry to its exit; OUT_OF_BODY once the wall of the real body is passed"""
+    """1 on the inner stretch of a model, from its entry to its exit; OUT_OF_BODY behind the real body's wall"""
     leave_point: F64_2D
     """shape (N, 3): where an inner stretch ends [m]"""
     leave_direction: F64_2D
