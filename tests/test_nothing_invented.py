@@ -25,7 +25,7 @@ def _mirrored(walls: int) -> float:
 def test_glass_alone_is_not_a_black_blob(model: Model) -> None:
     """A product without a stage around it: nobody knows what is behind, so the picture is left open there. A probe at
     its centre, which saw nothing, would answer black with full weight."""
-    planes = draw(scene([], [glass(model)], [BALL]), 33, 33, tiers=TIERS, cut=0.0)
+    planes = draw(scene([], [glass(model)], [BALL]), 33, 33, tiers=TIERS, cut=1e-7)
     walls = 1 if model in (Model.SPHERE, Model.BOX) else 2  # what is traced or thin mirrors on its far side, too
     np.testing.assert_allclose(planes["weight.none"][16, 16], 1.0, atol=1e-6)
     np.testing.assert_allclose(planes["beauty"][16, 16, 3], _mirrored(walls), atol=1e-3)
@@ -37,7 +37,7 @@ def test_several_walls_of_glass_alone_stay_open(roughness: float) -> None:
     """Four surfaces behind one another and nothing else: what the nearest cannot answer the next one cannot either, so
     more walls never make the picture more opaque than what they reflect."""
     panes = [quad(f"/pane{k}", [(-1, -1, -k), (1, -1, -k), (1, 1, -k), (-1, 1, -k)], 0) for k in range(4)]
-    planes = draw(scene(panes, [glass(Model.THIN, ROUGHNESS=roughness)]), 33, 33, tiers=TIERS, cut=0.0)
+    planes = draw(scene(panes, [glass(Model.THIN, ROUGHNESS=roughness)]), 33, 33, tiers=TIERS, cut=1e-7)
     assert planes["layers"][16, 16] == 4
     np.testing.assert_allclose(planes["beauty"][16, 16, 3], _mirrored(4), atol=1e-3)
     assert planes["beauty"][16, 16, :3].max() == 0.0
