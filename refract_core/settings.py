@@ -4,14 +4,41 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 from .errors import UsageError
 from .models import MODELS as MODELS
 
 TIERS = ("screen", "ray", "probe", "sky")
 SCREEN_METHODS = ("march", "proxy", "traced")
+QUALITIES: dict[str, dict[str, Any]] = {
+    "draft": {"samples": 1, "cut": 0.05},
+    "good": {"samples": 4, "cut": 0.02},
+    "best": {"samples": 16, "cut": 0.005, "tiers": ("probe", "ray", "sky")},
+    "reference": {"samples": 256, "cut": 0.0005, "tiers": ("ray", "sky"), "max_layers": 32},
+}
+"""What each level of quality stands for; each setting may also be chosen by its own name. The last two leave out what
+the picture lends its glass, and the last one also what probes do."""
+PRESETS: dict[str, dict[str, Any]] = {
+    "hdrp": {"screen": "proxy", "tiers": ("screen", "probe", "sky"), "max_layers": 1},
+}
+"""Settings that make other renderers' pictures."""
 PURPOSES = ("default", "render", "proxy", "guide")
 MAX_PIXELS = 1 << 28
+
+
+def named_settings(quality: str = "", preset: str = "") -> dict[str, Any]:
+    """Fields of `RenderSettings` that a level of quality and a preset stand for; where both do, the preset wins.
+
+    Raises:
+        UsageError: there is no such level or preset.
+    """
+    found: dict[str, Any] = {}
+    for field, name, table in (("quality", quality, QUALITIES), ("preset", preset, PRESETS)):
+        if name:
+            _tokens(field, (name,), tuple(table))
+            found |= table[name]
+    return found
 
 
 @dataclass(frozen=True, kw_only=True)

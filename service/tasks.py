@@ -32,8 +32,8 @@ _QUOTES = (
 """Where USD's messages begin to quote files, or its own source."""
 _UNITS = ("Z", "thickness", "path_length", "layers")
 """Planes that are not between 0 and 1: their PNG is scaled, and says by how much."""
-_SETTINGS = ("camera", "image_width", "image_height", "samples", "tiers", "screen", "model", "max_layers", "exposure",
-             "camera_light", "purposes")  # fmt: skip
+_SETTINGS = ("camera", "image_width", "image_height", "quality", "preset", "samples", "cut", "tiers", "screen", "model",
+             "max_layers", "exposure", "camera_light", "purposes")  # fmt: skip
 
 
 def perform(kind: str, stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[str, int], say: Say) -> Any:
@@ -90,20 +90,18 @@ def _tell(notices: tuple[Notice, ...] | list[Notice], say: Say, limits: Mapping[
 def _render(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[str, int], say: Say) -> Any:
     from refract_core.rendering.picture import render
     from refract_core.rendering.session import choose_camera
-    from refract_core.settings import RenderSettings
     from refract_core.usd.settings import read_settings
     from refract_core.usd.stage import open_stage, scene_from_stage
+    from refract_core.verbs.render_files import chosen_settings
     from refract_core.view.camera import image_size
 
     say(progress=0.0, stage="reading the stage")
     opened = open_stage(stage)
     found: list[Notice] = []
-    chosen: dict[str, Any] = dict(read_settings(opened, "", found))
+    authored = read_settings(opened, "", found)
     asked = {name: settings[name] for name in _SETTINGS if settings.get(name) is not None}
-    if "image_width" in asked and "image_height" not in asked:
-        chosen["image_height"] = 0
-    chosen.update({name: tuple(value) if isinstance(value, list) else value for name, value in asked.items()})
-    wanted = RenderSettings(**chosen, jobs=settings["threads"])
+    said = {name: tuple(value) if isinstance(value, list) else value for name, value in asked.items()}
+    wanted = chosen_settings(authored, {**said, "jobs": settings["threads"]})
     scene = scene_from_stage(
         opened, time_code=settings.get("time_code"), purposes=wanted.purposes, camera=wanted.camera
     )

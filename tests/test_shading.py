@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -237,3 +238,16 @@ def test_what_stands_behind_a_light_casts_no_shadow() -> None:
     )
     assert alone[8, 8, 0] > 0.01
     np.testing.assert_array_equal(alone[6:10, 6:10], under[6:10, 6:10])
+
+
+@pytest.mark.parametrize("height", [0.2, 0.5, 1.0, 2.0])
+def test_a_wall_takes_its_share_of_an_even_sky(height: float) -> None:
+    """A floor before an endless wall at distance 1 sees (1 + cos a) / 2 of an even sky, a the wall's height in angle
+    (the view factor of a half plane above an edge; Howell, A Catalog of Radiation Heat Transfer, A-5)."""
+    floor = quad("/floor", [(-50, 0, 50), (50, 0, 50), (50, 0, -50), (-50, 0, -50)], 0)
+    wall = quad("/wall", [(-50, 0, -1), (50, 0, -1), (50, height, -1), (-50, height, -1)], 1)
+    lens = camera((0, 3, 0), (0, 0, 0), fov=0.002)
+    what = scene([floor, wall], [material("/floor", DIFFUSE=0.5, SPECULAR=0.0, ROUGHNESS=1.0, specular_workflow=True),
+                                 material("/wall", DIFFUSE=0.0)], environment=dome(1.0), cameras=(lens,))  # fmt: skip
+    seen = draw(what, 16, 16, samples=64)["beauty"][..., 0].mean()
+    assert seen == pytest.approx(0.5 * (1.0 + math.cos(math.atan(height))) / 2.0, abs=0.012 * 0.5)

@@ -8,6 +8,7 @@ import typer
 
 from ..errors import UsageError
 from ..models import MODELS, explained
+from ..settings import PRESETS, QUALITIES
 from ..verbs.executors import crew_at
 from ..verbs.override import COLORS, RANGES
 from ..verbs.render_files import Order, render_files
@@ -40,6 +41,25 @@ ImageWidth = Annotated[
 ]
 ImageHeight = Annotated[int | None, typer.Option(help="Height in pixels. Without it the camera's aspect decides.")]
 Samples = Annotated[int | None, typer.Option(help="Samples per pixel, 1 to 4096. The default is 4.")]
+Quality = Annotated[
+    str | None,
+    typer.Option(
+        metavar="|".join(QUALITIES),
+        help="How much work goes into a picture: samples per pixel, how faint a branch of light is followed, and, from "
+        "best on, whether glass asks rays before the picture. The default is good; settings by name win over it.",
+    ),
+]
+Preset = Annotated[
+    str | None,
+    typer.Option(
+        metavar="|".join(PRESETS),
+        help="hdrp draws what Unity's HDRP would: the screen by proxy, then probes and sky, and one layer of glass.",
+    ),
+]
+Cut = Annotated[
+    float | None,
+    typer.Option(help="Weight below which a branch of light is not followed for itself, 0 to 1. The default is 0.02."),
+]
 Tiers = Annotated[
     str | None,
     typer.Option(
@@ -143,7 +163,10 @@ def render(
     frames: Frames = "",
     image_width: ImageWidth = None,
     image_height: ImageHeight = None,
+    quality: Quality = None,
+    preset: Preset = None,
     samples: Samples = None,
+    cut: Cut = None,
     tiers: Tiers = None,
     screen: Screen = None,
     model: ModelName = None,
@@ -167,7 +190,10 @@ def render(
         "camera": camera,
         "image_width": image_width,
         "image_height": image_height,
+        "quality": quality,
+        "preset": preset,
         "samples": samples,
+        "cut": cut,
         "tiers": None if tiers is None else words(tiers),
         "screen": screen,
         "model": model,

@@ -25,16 +25,16 @@ _TO_UNIT = 1.0 / 4294967296.0
 class Purpose(IntEnum):
     """What a sample decides. Each is a dimension of a branch."""
 
-    SKY_BELOW = 1
-    """a direction of the sky where every candidate was below the horizon"""
+    SKY_COSINE = 1
+    """a candidate of the sky, by its cosine"""
     MIRROR = 2
     """the microfacet that a mirror ray is reflected by"""
     ROUGH_LEAF = 3
     """the ray of a rough lobe that a tier traces"""
     SKY_PICK = 5
     """which of the sky's candidates"""
-    SKY_CANDIDATE = 6
-    """a candidate of the sky"""
+    SKY_RADIANCE = 6
+    """a candidate of the sky, by its radiance"""
     LIGHT = 16
     """a point of light 0; those of the other lights follow"""
 

@@ -11,7 +11,7 @@ from ..errors import UsageError
 from ..models import Model
 from ..progress import Report
 from ..scene import Notice, Scene
-from ..settings import RenderSettings
+from ..settings import QUALITIES, RenderSettings
 from .compare_numbers import Contrast, Findings, Mask, find, glass_of
 from .compare_report import Account, Pictures, check_folder, write_account
 from .orders import check_range, stop_if
@@ -63,7 +63,7 @@ def reference_settings(settings: RenderSettings, samples: int) -> RenderSettings
         settings: of the picture.
         samples: per pixel.
     """
-    return replace(settings, model=Model.TRACED.token, tiers=("ray", "sky"), max_layers=32, samples=samples)
+    return replace(settings, **{**QUALITIES["reference"], "model": Model.TRACED.token, "samples": samples})
 
 
 class Drawn(NamedTuple):

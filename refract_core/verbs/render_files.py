@@ -15,7 +15,7 @@ from ..files import write_whole
 from ..probes.digest import stale_bakes
 from ..progress import Report
 from ..scene import Notice, Scene
-from ..settings import RenderSettings
+from ..settings import RenderSettings, named_settings
 from .executors import Bench, Crew, file_bytes, patience, sent_stage, spread
 from .orders import size_text, stop_if
 from .override import OverrideError, Overrides, check_overrides, override, override_notes
@@ -243,8 +243,10 @@ def _stale(read: Callable[..., Scene], scene: Scene, settings: RenderSettings) -
 
 
 def chosen_settings(authored: Mapping[str, object], overrides: Mapping[str, object]) -> RenderSettings:
-    """Defaults, then what the stage authors, then what the caller says."""
-    chosen: dict[str, Any] = {**authored, **overrides}
+    """Defaults, then what the stage authors, then what the caller says: a quality, a preset, and settings by name."""
+    asked: dict[str, Any] = dict(overrides)
+    named = named_settings(asked.pop("quality", ""), asked.pop("preset", ""))
+    chosen: dict[str, Any] = {**authored, **named, **asked}
     if "image_width" in overrides and "image_height" not in overrides:
         chosen["image_height"] = 0  # a width alone keeps the camera's aspect, whatever the stage's resolution is
     return RenderSettings(**chosen)

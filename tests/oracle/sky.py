@@ -124,6 +124,16 @@ class Sky:
         ]
         return _cumulative([sum(row) for row in chance]), [_cumulative(row) for row in chance]
 
+    def density(self, d: Vec) -> float:
+        """Chance per solid angle with which `drawn` gives a world direction [1/sr]."""
+        rows, columns = self._chances
+        height, width = len(rows) - 1, len(columns[0]) - 1
+        u, v = self._uv(d)
+        row, column = min(int(v * height), height - 1), min(int(u * width), width - 1)
+        chance = (rows[row + 1] - rows[row]) * (columns[row][column + 1] - columns[row][column])
+        band = math.cos(row * math.pi / height) - math.cos((row + 1) * math.pi / height)
+        return chance / (band * 2.0 * math.pi / width)
+
     def drawn(self, u1: float, u2: float) -> Vec:
         """A world direction, in proportion to luminance."""
         rows, columns = self._chances

@@ -74,4 +74,4 @@ def _by_ray(shader: Shader, leaf: Leaf, view: View) -> Vec | None:
     if leaf.blur > 0.0:
         d = scattered(d, leaf.blur, *sampling.pair(view.key, view.sample, sampling.ROUGH_LEAF))
         hit = shader.nearest(leaf.origin, d, OPAQUE)
-    return None if hit is None else shader.radiance(hit._replace(width=0.0), d, view.key, view.sample)
+    return None if hit is None else shader.radiance(hit, d, view.key, view.sample)
