@@ -162,11 +162,7 @@ def meet(meeting: Meeting, lane: int, now: Rays, at: Interaction, world: World, 
         return
     if kind == ENTERED:
         kind = _enter(meeting, lane, now)
-<<<<<<< HEAD
     if now.inner[lane] == OUT_OF_BODY and kind in (ENTERED, ANSWERED):
-=======
-    if now.inner[lane] == OUT_OF_BODY and kind != PASSED and kind != LEFT:
->>>>>>> h-tests
         drop_medium(media, lane, slot_of(media, lane, now.thing[lane]))  # nothing else would ever end it
     elif kind == LEFT and filling(media, lane) != slot:
         drop_medium(media, lane, slot)  # something else fills the space on both sides
