@@ -162,7 +162,7 @@ def half_width(x: F64, seen: F64) -> float:
     return float(np.interp(0.75, np.maximum.accumulate(curve(fine)), fine))
 
 
-def by_screen(roughness: float, reference: float, options: Options, method: str = "march") -> float:
+def by_screen(roughness: float, reference: float, options: Options, method: str = "traced") -> float:
     """Blur of the screen tier. The picture shows 2 m of wall, whatever the roughness: levels are what is tested."""
     settings = rc.RenderSettings(
         image_width=options.size, image_height=options.size // 10, samples=1, tiers=("screen",), screen=method
@@ -178,7 +178,7 @@ def by_ray(roughness: float, reference: float, options: Options) -> float:
     return half_width(*profile(edge_scene(roughness, 8.0 * reference), settings))
 
 
-def by_probe(roughness: float, reference: float, options: Options, method: str = "march") -> float:
+def by_probe(roughness: float, reference: float, options: Options, method: str = "traced") -> float:
     """Blur of the probe tier. The window is wide enough for a blur several times too large."""
     settings = rc.RenderSettings(image_width=1024, image_height=16, samples=1, tiers=("probe",), screen=method)
     scenes = [edge_scene(roughness, 16.0 * reference, options.resolution, shift) for shift in _PROBE_SHIFTS]

@@ -72,7 +72,7 @@ class RenderSettings:
     jobs: int = 0
     """Threads; 0 means all cores."""
     tile_size: int = 64
-    """Pixels along a tile's side; rounded up to a multiple of 4. Never changes the picture."""
+    """Pixels along a tile's side; rounded up to a multiple of 8. Never changes the picture."""
 
     def __post_init__(self) -> None:
         _in_range("image_width", self.image_width, 1, MAX_PIXELS)

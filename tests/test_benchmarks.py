@@ -247,7 +247,7 @@ def test_the_tiers_table_at_a_tiny_size() -> None:
     """Where the ray tier answers what the screen cannot, it cannot be worse than HDRP, nor than the screen alone."""
     pytest.importorskip("flip_evaluator")
     options = tiers.Options(size=64, samples=1, resolution=32, repeat=0)
-    chosen = (tiers.MARCH, tiers.RAY, tiers.Arrangement("ray,sky"), tiers.HDRP)
+    chosen = (tiers.SCREEN, tiers.RAY, tiers.Arrangement("ray,sky"), tiers.HDRP)
     found = tiers.measure("sphere", options, chosen)
     assert found.scores[chosen[2]].psnr == math.inf
     assert found.scores[chosen[2]].flip == 0.0
@@ -256,7 +256,7 @@ def test_the_tiers_table_at_a_tiny_size() -> None:
     lines = tiers.table({"sphere": found})
     assert [line.split()[0] for line in lines[2:7]] == [tiers.TRUTH.label, *(row.label for row in chosen)]
     gain = found.scores[tiers.RAY].psnr - found.scores[tiers.HDRP].psnr
-    assert any(line.startswith("march, then ray, over HDRP") and f"{gain:+.1f}" in line for line in lines)
+    assert any(line.startswith("screen, then ray, over HDRP") and f"{gain:+.1f}" in line for line in lines)
 
 
 def test_the_ray_tier_blurs_as_the_monte_carlo_does() -> None:

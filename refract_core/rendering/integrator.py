@@ -19,7 +19,7 @@ class Pass(NamedTuple):
 class Integrator(Protocol):
     """Finds the light of every pixel, and adds it to the planes it was made with.
 
-    What it is made with is its own affair (`layered.Layered` shows it); a frame asks it for one sample after the other.
+    What it is made with is its own affair (`branching.Tree` shows it); a frame asks it for one sample after the other.
     """
 
     def passes(self, view: View, sample: int) -> Iterator[Pass]:
