@@ -43,6 +43,7 @@ import numpy as np
 import refract_core as rc
 from refract_core.errors import UsageError
 from refract_core.scene import F32, F64
+from refract_core.settings import named_settings
 from refract_core.verbs.compare import Mask, Picture, displayed, psnr
 
 from .curves import Needed, Point, needed, svg, times_faster
@@ -52,13 +53,9 @@ from .truth import Truth, converged
 from .two_rooms import ROOMS, Room
 
 OURS, THEIRS, PATH = "refract", "Mitsuba", "Mitsuba path"
-LEVELS: dict[str, dict[str, Any]] = {
-    "1 sample": {"samples": 1},
-    "4 samples": {"samples": 4},
-    "16 samples": {"samples": 16},
-}
+LEVELS: dict[str, dict[str, Any]] = {level: named_settings(level) for level in ("draft", "good", "best")}
 """What is measured of ours: the name in the table, and the settings beyond size and threads."""
-BEST: tuple[str, dict[str, Any]] = ("64 samples", {"samples": 64})
+BEST: tuple[str, dict[str, Any]] = ("reference", {**named_settings("reference"), "samples": 64})
 """The nearest to the truth that ours can come; drawn once, and not timed by turns."""
 DECIBELS = (31, 33, 37, 43, 45, 49)
 _WINDOW = 5
