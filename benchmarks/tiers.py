@@ -6,8 +6,9 @@ Five things of glass, one at a time, in a furnished room (`benchmarks.room`). Th
 same traced glass: what is measured is the tiers, not the model. Only what comes through the glass is compared, inside
 the glass; its reflection is taken off. Every number is PSNR in dB / mean LDR-FLIP of sRGB pictures.
 
-HDRP's own row is HDRP whole: proxy reprojection, its typed models, one surface of glass. For every shape it gets that of sphere,
-box and thin which comes out best, with the thickness an author would type, and the room itself as proxy.
+HDRP's own row is HDRP whole: proxy reprojection, its typed models, one surface of glass. For every shape it gets
+that of sphere, box and thin which comes out best, with the thickness an author would type, and the room itself as
+proxy.
 
 Milliseconds are those of `render` in a warm process, the best of the repeats and the median of the shapes. In rows
 with a probe they hold its capture, which a baked probe saves; what that takes is also printed by itself.

@@ -150,7 +150,7 @@ def test_a_refusal_names_the_field_and_leads_to_it(page: Any) -> None:
 
 def test_a_failed_job_shows_its_problem_and_keeps_the_last_picture(page: Any) -> None:
     pick(page)
-    page.get_by_label("Layers of glass").fill("13")
+    page.get_by_label("Surfaces of glass a ray enters").fill("13")
     status(page, "Failed.")
     alert = page.get_by_role("alert")
     for part in ("The renderer crashed", "Too deep.", "Prim: /World/Ball"):

@@ -14,6 +14,7 @@ from scenes import box, camera, checker_room, draw, glass, light, material, quad
 
 import refract_core as rc
 from refract_core.errors import Cancelled, UsageError
+from refract_core.kernels.sampling import pixel_offsets
 from refract_core.scene import LightKind, Model, Scene, Sphere
 
 F32 = NDArray[np.float32]
@@ -112,10 +113,18 @@ def test_a_given_executor_draws_the_same(mixed: Scene) -> None:
 
 
 def test_more_samples_keep_data_planes_and_change_edges(mixed: Scene) -> None:
-    """Data planes hold sample 0; coverage becomes fractional at silhouettes only."""
+    """Data planes hold the sample nearest to the pixel's centre, as a camera sees it that is turned there; coverage
+    becomes fractional at silhouettes only."""
     one, four = draw(mixed, samples=1), draw(mixed, samples=4)
+    offset = pixel_offsets(4)[0]
+    lens = mixed.cameras[0]
+    left, right, bottom, top = lens.window
+    dx, dy = offset[0] * (right - left) / 64, -offset[1] * (top - bottom) / 64  # rows count downwards
+    there = replace(lens, window=(left + dx, right + dx, bottom + dy, top + dy))
+    alone = draw(replace(mixed, cameras=(there,)), samples=1)
     for name in ("Z", "N", "P", "thickness", "path_length", "layers"):
-        np.testing.assert_array_equal(one[name], four[name], err_msg=name)
+        same = np.isclose(alone[name], four[name], rtol=1e-4, atol=1e-5)
+        assert same.mean() > 0.995, name  # a ray at an edge may meet either side
     assert set(np.unique(one["mask"])) <= {0.0, 1.0}
     assert ((four["mask"] > 0) & (four["mask"] < 1)).any()
 
