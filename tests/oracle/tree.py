@@ -77,6 +77,8 @@ class Inner(NamedTuple):
 
     body: Medium
     passage: Passage
+    beyond: bool = False
+    """the wall of the real body has been passed"""
 
 
 class Ray(NamedTuple):
@@ -210,7 +212,11 @@ class Tree:
         choice = self._choice(ray, hit)
         ray = choice.ray.absorb(hit.t)
         if choice.step is Step.PASSES:
+            if ray.inner is not None and hit.face.thing == ray.inner.body.thing:
+                ray = ray._replace(inner=ray.inner._replace(beyond=dot(hit.ng, ray.direction) > 0.0))
             return [ray.passed(hit.t, choice.behind)]
+        if choice.step is not Step.LEAVES:
+            ray = ray._replace(media=_still_in(ray))
         return self._split(ray, hit, choice, view, grown)
 
     # --- What it meets ---
@@ -242,8 +248,9 @@ class Tree:
         model = model_at(self.scene, hit, self.settings.model)
         within = any(m.thing == thing for m in media)
         straight = Choice(ray, Step.PASSES, None, media)
+        still = _still_in(ray)
         if model is Model.THIN:
-            return Choice(ray, Step.PANE, medium_at(self.scene, hit, model), media)
+            return Choice(ray, Step.PANE, medium_at(self.scene, hit, model), still)
         outer = not inner if model is Model.TRACED else (not inner or hit.face.sheet) and not within
         if outer:
             if len(media) >= MOST:
@@ -251,12 +258,15 @@ class Tree:
             body = medium_at(self.scene, hit, model)
             before = filling(media)
             if model is not Model.TRACED:
+                before = filling(still)
                 if before is not None:  # whatever is around, along the stretch it is the model's body that counts
                     body = body._replace(priority=max(body.priority, before.priority))
-                return Choice(ray, Step.TYPED, body, (*media, body))
+                return Choice(ray, Step.TYPED, body, (*still, body))
             behind = (*media, body)
             again = before is not None and before.thing == thing
-            return Choice(ray, Step.ENTERS if filling(behind) is body and not again else Step.PASSES, body, behind)
+            if filling(behind) is body and not again:
+                return Choice(ray, Step.ENTERS, body, (*still, body))
+            return Choice(ray, Step.PASSES, body, behind)
         if inner and not within and self._is_cut(ray, hit, model):
             media = (*media, medium_at(self.scene, hit, model))
             within, ray = True, ray._replace(media=media)
@@ -454,6 +464,13 @@ def _beside(ray: Ray, s: Surface) -> Ray:
     step at each reflection, so this is part of where it comes to."""
     step = math.copysign(_BESIDE[0] * max(abs(c) for c in s.point) + _BESIDE[1], dot(s.ng, ray.direction))
     return ray._replace(origin=add(s.point, scaled(s.ng, step)))
+
+
+def _still_in(ray: Ray) -> Media:
+    """What a ray is in that enters something. A model's inner stretch beyond the real body's wall has left the body."""
+    if ray.inner is None or not ray.inner.beyond:
+        return ray.media
+    return tuple(m for m in ray.media if m is not ray.inner.body)
 
 
 def _out(ray: Ray, inner: Inner) -> Ray:
