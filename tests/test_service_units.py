@@ -17,7 +17,7 @@ from service_stages import HEAD, escapes, referring
 
 from refract_core.errors import UsageError
 from refract_core.images.aovs import AOVS
-from refract_core.settings import MODELS, PURPOSES, SCREEN_METHODS, TIERS, RenderSettings
+from refract_core.settings import MODELS, PRESETS, PURPOSES, QUALITIES, SCREEN_METHODS, TIERS, RenderSettings
 from service import confine, models, precheck, problems, tasks
 from service.app import Settings, create_app
 from service.bodies import check, parse
@@ -54,9 +54,10 @@ def test_the_models_have_the_engines_words() -> None:
     assert get_args(models.Tier) == TIERS
     assert get_args(models.Purpose) == PURPOSES
     assert get_args(models.Aov) == tuple(AOVS)
-    known = {one.name for one in fields(RenderSettings)} - {"jobs", "tile_size", "cut"}
+    known = {one.name for one in fields(RenderSettings)} - {"jobs", "tile_size"}
     assert known <= models.Render.model_fields.keys()
-    assert set(SCREEN_METHODS) == {"march", "proxy", "traced"}
+    for field, words in (("screen", SCREEN_METHODS), ("quality", QUALITIES), ("preset", PRESETS)):
+        assert get_args(get_args(models.Render.model_fields[field].annotation)[0]) == tuple(words)
 
 
 @pytest.mark.parametrize(
