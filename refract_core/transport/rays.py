@@ -208,7 +208,8 @@ def absorb(rays: Rays, i: int, until: float) -> None:
     k = filling(rays.media, i)
     if k != AIR:
         length = max(0.0, until - rays.begun[i])
-        left = transmittance(row(rays.media.color[i], k), rays.media.distance[i, k], length)
-        put(rays.weight, i, mul(row(rays.weight, i), left))
+        color = row(rays.media.color[i], k)
+        if min(color[0], color[1], color[2]) < 1.0:  # three exponentials that clear glass does not need
+            put(rays.weight, i, mul(row(rays.weight, i), transmittance(color, rays.media.distance[i, k], length)))
         rays.path[i] += length
     rays.begun[i] = until
