@@ -69,9 +69,9 @@ def plan_picture(scene: Scene, camera: Camera, *, drawn: bool, proxies: bool) ->
         drawn: the probe tier is going to be asked.
         proxies: the screen tier is going to guess by proxies, of which every piece of glass needs one.
     """
-    glass = _glass(scene)
     thing_probe = np.full(len(scene.meshes) + len(scene.spheres), -1, np.int32)
-    if not (drawn or proxies) or not glass:
+    asked = proxies or (drawn and scene.probes)
+    if not asked or not (glass := _glass(scene)):
         return Plan([], thing_probe, [])
     serving = [p for p in in_order(list(scene.probes)) if _serves(p, camera, glass, scene)]
     plan = plan_capture(scene, serving)
