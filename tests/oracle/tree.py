@@ -39,7 +39,7 @@ _MOST_MET = 128
 _LATE = 96
 """After so many a ray is let out at the next occasion."""
 _FAINT = 1.0 / 32.0
-_FORGOTTEN = 24
+_FORGOTTEN = 16
 """After so many interfaces, each of which may double an error, float32 does not say any more where a ray is."""
 _HEEDED = 1e-3
 """Of a pixel's light; what weighs less may be elsewhere, or not be."""
