@@ -200,19 +200,23 @@ def test_other_arguments_are_numbas_business(site: Path) -> None:
 import sys
 import numpy as np
 from refract_core.kernels.pointer import Pointer
-from refract_core.view.gbuffer import OpaqueLayer
-from refract_core.view.planes import add_tile, new_planes
+from refract_core.scene import Camera
+from refract_core.view.camera import view_of
+from refract_core.view.planes import Finish, Planes, finish_tile, new_planes
 
-def added(dtype, tile):
-    planes = new_planes(4, 2)
-    ones = OpaqueLayer(*(np.ones(shape, dtype) for shape in ((2, 4, 4), (2, 4), (2, 4, 3))))
-    add_tile(Pointer(planes), Pointer(ones), np.array([4, 2]), tile)
+view = view_of(Camera("/camera", np.eye(4), (-1.0, 1.0, -0.5, 0.5)), 4, 2)
+doubled = Finish(2.0, 2.0, 1.0, np.eye(4), np.eye(3))
+
+def finished(dtype, tile):
+    planes = Planes(*(plane.astype(dtype) for plane in new_planes(4, 2)))
+    planes.beauty[:] = 1.0
+    finish_tile(Pointer(planes), Pointer(view), Pointer(doubled), tile)
     return planes.beauty.sum()
 
-assert added(np.float32, (1, 0, 4, 2)) == 24.0
-assert added(np.float32, (np.int64(1), np.int32(0), 4, 2)) == 24.0
+assert finished(np.float32, (1, 0, 4, 2)) == 6 * 4 * 2.0 + 2 * 4
+assert finished(np.float32, (np.int64(1), np.int32(0), 4, 2)) == 56.0
 assert "numba" not in sys.modules
-assert added(np.float64, (1, 0, 4, 2)) == 24.0
+assert finished(np.float64, (1, 0, 4, 2)) == 56.0
 assert "numba" in sys.modules
 """
     run(program, site)
