@@ -23,7 +23,7 @@ from ..world.lights import pack_lights
 from ..world.tables import World, pack_geometry, pack_materials, world_of
 from .work import Cancel, Progress, Work, working
 
-_PROBE_SAMPLES = 4
+_PROBE_SAMPLES = 16
 """Most rays per probe texel; more samples of the picture do not make probes finer."""
 
 
