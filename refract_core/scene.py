@@ -141,6 +141,8 @@ class Mesh:
     """Every edge is shared by exactly two triangles of opposite direction."""
     static: bool = True
     """Neither geometry nor transform varies in time and `primvars:refract:static` is not 0."""
+    inside_out: bool = False
+    """Closed glass whose faces look inwards as authored; here they are turned outwards already."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scene_reading import CUBE, TWO_TRIANGLES, areas, read, signed_volume, texts, to_stage
+from pxr import UsdGeom
+from scene_reading import CUBE, TWO_TRIANGLES, areas, read, signed_volume, stage_of, texts, to_stage
+from scenes import draw
 
 from refract_core.scene import Mesh, Scene
 
@@ -337,3 +339,207 @@ def test_one_material_is_read_once_for_closed_and_once_for_open_meshes() -> None
     assert by_path["/C0"] == by_path["/C1"] == by_path["/C2"] != by_path["/Open"]
     assert scene.materials[by_path["/C0"]].model.name == "TRACED"
     assert scene.materials[by_path["/Open"]].model.name == "THIN"
+
+
+# --- glass inside out -----------------------------------------------------------------------------------------------
+
+GLASS = """def Material "Glass" (prepend apiSchemas = ["RefractMaterialAPI"]) {
+    uniform token refraction:model = "MODEL"
+    color3f inputs:refraction:transmittanceColor = (0.3, 0.6, 0.9)
+    float inputs:refraction:absorptionDistance = 1
+    float inputs:refraction:thickness = 1 }
+"""
+BEHIND = """def Mesh "Wall" {
+    uniform token subdivisionScheme = "none"
+    int[] faceVertexCounts = [4]
+    int[] faceVertexIndices = [0, 1, 2, 3]
+    point3f[] points = [(-9, -9, -3), (9, -9, -3), (9, 9, -3), (-9, 9, -3)]
+    color3f[] primvars:displayColor = [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0)] (interpolation = "vertex") }
+def DomeLight "Sky" { color3f inputs:color = (0.5, 0.6, 0.7) }
+def Camera "Eye" {
+    float focalLength = 24
+    double3 xformOp:translate = (0.4, 0.7, 6)
+    uniform token[] xformOpOrder = ["xformOp:translate"] }
+"""
+TURNED = """float3 xformOp:rotateXYZ = (20, 30, 40)
+    float3 xformOp:scale = (SX, 0.9, 1.1)
+    uniform token[] xformOpOrder = ["xformOp:rotateXYZ", "xformOp:scale"]
+"""
+LEFT = 'uniform token orientation = "leftHanded"\n'
+CUBE_FACES = [[1, 3, 7, 5], [2, 0, 4, 6], [3, 2, 6, 7], [0, 1, 5, 4], [4, 5, 7, 6], [2, 3, 1, 0]]
+"""Outwards; point i is (i % 2, i // 2 % 2, i // 4)."""
+
+
+def body(
+    kind: str, *, reverse: bool = False, left: bool = False, scale: int = 1, normals: str = "", extra: str = ""
+) -> str:
+    """A cube, or one with a cubic hollow whose faces look into it, of glass.
+
+    Args:
+        reverse: the faces run the other way round, and with them their authored normals find their corners
+        normals: '' for none, or the side that they look to: outwards, inwards
+        scale: 1, or -1 to mirror it
+    """
+    cube = np.array([(x, y, z) for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)], np.float64)
+    shells = [(cube, CUBE_FACES)]
+    if kind == "hollow":
+        shells.append((0.6 * cube, [face[::-1] for face in CUBE_FACES]))
+    points: list[tuple[float, ...]] = []
+    indices: list[int] = []
+    vectors: list[tuple[float, ...]] = []
+    for corners, faces in shells:
+        for face in faces:
+            a, b, c = corners[face[:3]]
+            across = np.cross(b - a, c - b)
+            outwards = across / np.linalg.norm(across)
+            order = face[::-1] if reverse else face
+            indices += [len(points) + k for k in order]
+            vectors += [tuple((outwards if normals == "outwards" else -outwards).tolist())] * 4
+        points += [tuple(p) for p in corners.tolist()]
+    told = f'normal3f[] normals = {vectors} (interpolation = "faceVarying")\n' if normals else ""
+    places = [points[k] for k in indices]
+    return f"""def Mesh "Body" (prepend apiSchemas = ["MaterialBindingAPI"]) {{
+        uniform token subdivisionScheme = "none"
+        rel material:binding = </Glass>
+        int[] faceVertexCounts = {[4] * (len(indices) // 4)}
+        int[] faceVertexIndices = {indices}
+        point3f[] points = {points}
+        float[] primvars:refraction:thickness = {[x + 2 * y + 3 * z + 7 for x, y, z in places]} (
+            interpolation = "faceVarying" )
+        {told}{LEFT if left else ""}{TURNED.replace("SX", str(scale))}{extra} }}
+        """
+
+
+def of_glass(text: str, model: str = "traced") -> Scene:
+    return read(BEHIND + text + GLASS.replace("MODEL", model))
+
+
+def body_of(scene: Scene) -> Mesh:
+    (mesh,) = [mesh for mesh in scene.meshes if mesh.path == "/Body"]
+    return mesh
+
+
+@pytest.mark.parametrize("scale", [1, -1])
+@pytest.mark.parametrize("left", [False, True])
+@pytest.mark.parametrize("kind", ["cube", "hollow"])
+def test_closed_glass_looks_outwards_however_it_is_authored(kind: str, left: bool, scale: int) -> None:
+    """A hollow body as a whole: its outer shell outwards, its inner shell into the hollow."""
+    volume = 8.0 * 0.9 * 1.1 * (1.0 - 0.6**3 if kind == "hollow" else 1.0)
+    for reverse in (False, True):
+        scene = of_glass(body(kind, reverse=reverse, left=left, scale=scale))
+        mesh = body_of(scene)
+        assert mesh.closed
+        assert signed_volume(mesh) == pytest.approx(volume, rel=1e-5)
+        assert mesh.inside_out is (reverse is not left)
+        assert ("faces look inwards" in texts(scene, "/Body")) is mesh.inside_out
+
+
+@pytest.mark.parametrize("normals", ["", "outwards", "inwards"])
+@pytest.mark.parametrize("kind", ["cube", "hollow"])
+def test_glass_inside_out_has_the_arrays_of_the_right_one(kind: str, normals: str) -> None:
+    """Inside out by its orientation alone, the corners keep their order: everything is equal to the bit.
+
+    Normals that look inwards were made from the faces and turn with them; others were right, and stay.
+    """
+    right = body_of(of_glass(body(kind, normals=normals and "outwards")))
+    wrong = body_of(of_glass(body(kind, normals=normals, left=True)))
+    np.testing.assert_array_equal(wrong.triangles, right.triangles)
+    np.testing.assert_array_equal(wrong.points, right.points)
+    np.testing.assert_array_equal(wrong.primvars["refraction:thickness"], right.primvars["refraction:thickness"])
+    if normals:
+        assert wrong.normals is not None
+        assert right.normals is not None
+        np.testing.assert_array_equal(wrong.normals, right.normals)
+    else:
+        assert wrong.normals is None
+
+
+@pytest.mark.parametrize("normals", ["", "inwards"])
+@pytest.mark.parametrize("scale", [1, -1])
+def test_reversed_corners_keep_their_own_primvars_and_normals(scale: int, normals: str) -> None:
+    """The thickness tells the place in the prim, and the normal of a flat face is that of its triangle."""
+    text = body("hollow", reverse=True, scale=scale, normals=normals)
+    scene, stage = of_glass(text), stage_of(text)
+    mesh = body_of(scene)
+    matrix = np.array(UsdGeom.Xformable(stage.GetPrimAtPath("/Body")).GetLocalTransformation()).T
+    at = to_stage(scene, mesh.points[mesh.triangles].reshape(-1, 3)) @ np.linalg.inv(matrix[:3, :3]).T
+    told = mesh.primvars["refraction:thickness"].ravel()
+    assert told == pytest.approx(at @ (1, 2, 3) + 7, abs=1e-5)
+    if mesh.normals is not None:
+        faces = areas(mesh.points, mesh.triangles)
+        faces /= np.linalg.norm(faces, axis=1, keepdims=True)
+        assert mesh.normals == pytest.approx(np.repeat(faces[:, None], 3, axis=1), abs=1e-5)
+
+
+@pytest.mark.parametrize("model", ["traced", "box", "sphere"])
+@pytest.mark.parametrize("kind", ["cube", "hollow"])
+def test_glass_inside_out_is_the_picture_of_the_right_one(kind: str, model: str) -> None:
+    right = draw(of_glass(body(kind), model), 40, 40)
+    for how in ({"left": True}, {"reverse": True}, {"left": True, "normals": "inwards"}):
+        wrong = draw(of_glass(body(kind, **how), model), 40, 40)
+        assert right["mask"].any()
+        for name in ("beauty", "thickness", "path_length"):
+            np.testing.assert_allclose(wrong[name], right[name], atol=1e-5, err_msg=f"{name} {how}")
+
+
+def test_a_cage_inside_out_is_smooth_the_right_way_round() -> None:
+    extra = 'rel material:binding = </Glass>\nuniform token orientation = "{}Handed"'
+    right, wrong = (
+        read(CUBE(scheme="catmullClark", extra=extra.format(hand)) + GLASS.replace("MODEL", "traced")).meshes[0]
+        for hand in ("right", "left")
+    )
+    assert wrong.normals is not None
+    assert right.normals is not None
+    np.testing.assert_array_equal(wrong.triangles, right.triangles)
+    np.testing.assert_allclose(wrong.normals, right.normals, atol=1e-6)
+
+
+def test_what_is_opaque_or_open_is_left_as_it_is_authored() -> None:
+    (opaque,) = read(CUBE(reverse=True)).meshes
+    assert signed_volume(opaque) == pytest.approx(-8)
+    scene = read(TWO_TRIANGLES(f"rel material:binding = </Glass>\n{LEFT}") + GLASS.replace("MODEL", "thin"))
+    (sheet,) = scene.meshes
+    assert areas(sheet.points, sheet.triangles)[:, 2] == pytest.approx((-0.5, -0.5))
+    assert not opaque.inside_out
+    assert not sheet.inside_out
+    assert "inwards" not in texts(scene, "/M")
+
+
+def test_a_sheet_folded_onto_itself_has_no_inside_to_be_out() -> None:
+    """Both ways round its volume is rounding and no more."""
+    for order in (1, -1):
+        front, back = [0, 1, 2, 3][::order], [3, 2, 1, 0][::order]
+        scene = read(f"""def Mesh "M" {{
+            uniform token subdivisionScheme = "none"
+            rel material:binding = </Glass>
+            int[] faceVertexCounts = [4, 4]
+            int[] faceVertexIndices = {front + back}
+            point3f[] points = [(0.1, 0.2, 0.3), (1.1, 0.3, 0.7), (1.3, 1.2, 1.9), (0.3, 1.1, 1.5)] }}
+            """ + GLASS.replace("MODEL", "traced"))
+        (mesh,) = scene.meshes
+        assert mesh.closed
+        assert not mesh.inside_out
+
+
+def test_part_of_a_mesh_that_is_glass_turns_all_of_it() -> None:
+    subset = """def GeomSubset "s" (prepend apiSchemas = ["MaterialBindingAPI"]) {
+        uniform token elementType = "face"
+        uniform token familyName = "materialBind"
+        int[] indices = [0, 1]
+        rel material:binding = </Glass> }"""
+    scene = read(CUBE(reverse=True, extra=subset) + GLASS.replace("MODEL", "traced"))
+    (mesh,) = scene.meshes
+    assert signed_volume(mesh) == pytest.approx(8)
+    assert "faces look inwards" in texts(scene, "/C")
+
+
+def test_instances_inside_out_are_counted_in_one_notice() -> None:
+    shared = f"""class "Proto" {{ {CUBE(reverse=True, extra="rel material:binding = </Glass>")} }}"""
+    places = [f"""def "I{i}" ( instanceable = true
+        references = </Proto> ) {{ }}""" for i in range(3)]  # fmt: skip
+    scene = read(shared + "\n".join(places) + GLASS.replace("MODEL", "traced"))
+    assert [signed_volume(mesh) for mesh in scene.meshes] == pytest.approx([8, 8, 8])
+    (notice,) = [notice for notice in scene.notices if "faces look inwards" in notice.text]
+    assert notice.path == "/I0/C"
+    assert "3 prims" in notice.text
+    assert "refract validate" in notice.text

@@ -139,6 +139,26 @@ def test_fix_writes_what_the_renderer_uses_anyway(name: str, tmp_path: Path) -> 
     assert load_stage(out).materials == load_stage(source).materials
 
 
+def test_fix_turns_what_the_renderer_turns_anyway(tmp_path: Path) -> None:
+    source, out = BAD["inverted-normals"], tmp_path / "fixed.usda"
+    assert validate(ValidateOrder(stage=str(source), fix=str(out))).fixed
+    (before,), (after,) = load_stage(source).meshes, load_stage(out).meshes
+    assert (before.inside_out, after.inside_out) == (True, False)
+    np.testing.assert_array_equal(before.triangles, after.triangles)
+
+
+def test_inside_out_glass_is_told_once_with_and_without_a_part_that_is_opaque() -> None:
+    subset = f"""def GeomSubset "s" (prepend apiSchemas = ["MaterialBindingAPI"]) {{
+        uniform token elementType = "face"
+        uniform token familyName = "materialBind"
+        int[] indices = [0, 1]
+        {BOUND} }}"""
+    for extra in (subset, BOUND):
+        found = stage_findings(stage_of(CUBE(reverse=True, extra=extra) + GLASS.format(model="traced", thickness=2)))
+        about = [finding for finding in found if "inwards" in finding.text]
+        assert [(finding.rule, bool(finding.repairs)) for finding in about] == [("refract.inverted-normals", True)]
+
+
 def test_fix_keeps_what_is_good_of_an_animated_value(tmp_path: Path) -> None:
     path = tmp_path / "animated.usda"
     text = (SAMPLES / "bad" / "ior_below_one.usda").read_text("utf-8")

@@ -13,6 +13,9 @@ from ..scene import F64
 CONVEX_TOLERANCE = 0.005
 """Convex: no vertex lies further than this in front of any face, against the diagonal of the bounding box."""
 
+_NOTHING = 1.0e-14
+"""Volume under which a surface encloses nothing, against the cube of its diagonal: what rounding leaves of a sheet that
+is folded back onto itself."""
 _FACES = 512
 """Faces of a mesh whose planes are looked at for convexity."""
 
@@ -21,6 +24,11 @@ def signed_volume(points: F64, triangles: NDArray[np.integer]) -> float:
     """[cube of the unit], by the divergence theorem: positive where a closed surface faces outwards."""
     a, b, c = (points[triangles[:, side]] - points[triangles[0, 0]] for side in range(3))
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum()) / 6.0
+
+
+def looks_inwards(points: F64, triangles: NDArray[np.integer]) -> bool:
+    """A closed surface is inside out: as a whole, so the inner shell of something hollow does not make it so."""
+    return signed_volume(points, triangles) < -_NOTHING * float(np.linalg.norm(np.ptp(points, axis=0))) ** 3
 
 
 def is_convex(points: F64, triangles: NDArray[np.integer]) -> bool:

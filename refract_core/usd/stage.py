@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from .camera import choose_camera, read_cameras
 from .diagnostics import captured, words_of
 from .geometry.parts import Bound, Part, Tables, assemble, bind
 from .geometry.place import Placed, bounds_of, place, to_mesh, to_sphere
-from .geometry.shapes import Shape, read_shape
+from .geometry.shapes import INWARDS, TURN, Shape, read_shape
 from .geometry.skel import posed
 from .geometry.traverse import Placement, some_of, walk
 from .lights.read import read_lights
@@ -253,6 +253,7 @@ def _placed(placements: list[Placement], metres_from_stage: F64, tables: Tables)
     if cages:
         text = "subdivision surfaces are drawn as their control cage, with smooth normals: subdivision is not done yet"
         tables.notices.append(Notice(cages[0], f"{text} ({some_of(cages)})"))
+    tables.notices.extend(_turned(prims, parts))
     placed = []
     for placement in placements:
         part = parts[placement.prim.GetPath()]
@@ -260,6 +261,20 @@ def _placed(placements: list[Placement], metres_from_stage: F64, tables: Tables)
         if item is not None:
             placed.append(item)
     return placed
+
+
+def _turned(prims: list[Usd.Prim], parts: dict[Sdf.Path, Part | None]) -> Iterator[Notice]:
+    """Which glass is inside out; the instances of one native prototype are told of together."""
+    found: dict[Sdf.Path, list[str]] = {}
+    for prim in prims:
+        part = parts[prim.GetPath()]
+        if part is not None and part.shape.inside_out:
+            authored = prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim
+            found.setdefault(authored.GetPath(), []).append(str(prim.GetPath()))
+    bubble = "a bubble belongs to the mesh of the glass around it, or is a body of ior 1"
+    text = f"{INWARDS}; it is drawn turned outwards. {TURN.capitalize()} (refract validate STAGE --fix OUT); {bubble}"
+    for paths in found.values():
+        yield Notice(paths[0], f"{text} ({some_of(paths)})" if len(paths) > 1 else text)
 
 
 def _part(prim: Usd.Prim, bound: Bound, shapes: dict[Sdf.Path, Shape | None], tables: Tables) -> Part | None:

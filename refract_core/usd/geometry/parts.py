@@ -87,9 +87,12 @@ def assemble(prim: Usd.Prim, shape: Shape, bound: Bound, tables: Tables) -> Part
     """Reads the materials of a prim and the primvars they use."""
     materials = _triangle_materials(prim, shape, bound, tables)
     alike = shape.topology is None or not bound.subsets
+    used = [tables.materials[number] for number in (materials[:1] if alike else np.unique(materials)).tolist()]
+    if any(material.refractive for material in used):
+        shape = shape.outwards  # only glass has a side that light enters by
     wanted: frozenset[str] = frozenset()
-    for number in materials[:1].tolist() if alike else np.unique(materials).tolist():
-        wanted |= _primvars_of(tables.materials[number])
+    for material in used:
+        wanted |= _primvars_of(material)
     primvars: dict[str, F32] = {}
     for name in sorted(wanted):
         corners = read_primvar(prim, name, tables.time, shape.topology, tables.notices) or shape.natural.get(name)

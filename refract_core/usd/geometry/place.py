@@ -122,6 +122,7 @@ def to_mesh(item: Placed, centre: F64) -> Mesh:
         double_sided=shape.double_sided,
         closed=shape.closed,
         static=item.placement.static and not shape.varying,
+        inside_out=shape.inside_out,
     )
 
 

@@ -28,6 +28,10 @@ class Topology(NamedTuple):
     point_count: int
     face_count: int
 
+    def turned_over(self) -> Topology:
+        """The same of triangles whose last two corners have changed places."""
+        return self._replace(corners=turned_over(self.corners), vertices=turned_over(self.vertices))
+
 
 class Corners(NamedTuple):
     """Values and which of them each triangle corner takes."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import lru_cache
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,11 +11,15 @@ from numpy.typing import NDArray
 from pxr import Usd, UsdGeom
 
 from ...scene import F32, F64, U32, Notice
+from ...thickness.solid import looks_inwards
 from . import gprims
 from .primvars import Corners, Topology, Unusable, as_values, evaluate, to_corners
 from .triangulate import Index, Triangles, fans, fans_fit, is_closed, smooth_normals, triangulate, turned_over
 
 SUBDIVIDED = (UsdGeom.Tokens.catmullClark, UsdGeom.Tokens.loop)
+INWARDS = "the mesh is closed but its faces look inwards"
+TURN = "turn its orientation attribute round, or reverse its faces"
+"""What to do about it."""
 _MESH_ATTRIBUTES = ("points", "faceVertexCounts", "faceVertexIndices", "holeIndices", "normals")
 _LARGEST = 1.0e15
 """Coordinates beyond it are taken for garbage: their squares still fit float32."""
@@ -31,7 +35,7 @@ class Shape:
     points: F32
     """shape (V, 3), in shape space"""
     triangles: U32
-    """shape (T, 3), counter-clockwise seen from outside"""
+    """shape (T, 3), counter-clockwise seen from outside, as authored"""
     normals: Corners | None = None
     """Unit normals, or None: flat"""
     topology: Topology | None = None
@@ -48,6 +52,34 @@ class Shape:
     """Shape space holds the unit sphere about the origin."""
     cage: bool = False
     """The control cage of a subdivision surface."""
+    inside_out: bool = False
+    """Its faces looked inwards before they were turned; see `outwards`."""
+
+    @property
+    def outwards(self) -> Shape:
+        """The same solid looking outwards: itself, unless it is a closed mesh that is inside out.
+
+        Its total volume decides, so a hollow solid keeps its inner shell. Normals are judged as a whole too, not one by
+        one: they were either made from the faces, and turn with them, or were right from the start.
+        """
+        turned = self._turned
+        return self if turned is None else turned
+
+    @cached_property
+    def _turned(self) -> Shape | None:
+        """Instances of a prototype share it. None where nothing is to turn: a shape that held itself would stay."""
+        if not self.closed or self.topology is None:
+            return None
+        points = self.points.astype(np.float64)
+        if not looks_inwards(points, self.triangles):
+            return None
+        triangles, normals = turned_over(self.triangles), self.normals
+        if normals is not None and normals.rows is not None:
+            rows = turned_over(normals.rows)
+            against = _agreement(normals.values, rows, points, triangles) < 0.0
+            normals = Corners(-normals.values if against else normals.values, rows)
+        topology = self.topology.turned_over()
+        return replace(self, triangles=triangles, normals=normals, topology=topology, inside_out=True)
 
 
 def read_shape(prim: Usd.Prim, time: Usd.TimeCode, notices: list[Notice]) -> Shape | None:
@@ -264,6 +296,13 @@ def _any_of_face(corner_flags: NDArray[np.bool_], starts: Index, counts: Index) 
     last = len(corner_flags)
     found: NDArray[np.bool_] = running[np.minimum(starts + counts, last)] > running[np.minimum(starts, last)]
     return found
+
+
+def _agreement(normals: F32, rows: Index, points: F64, triangles: U32) -> float:
+    """Sum of area times cosine between the faces and the normals at their corners: negative if most look against."""
+    around = points[triangles]
+    areas = np.cross(around[:, 1] - around[:, 0], around[:, 2] - around[:, 0])
+    return float(sum(np.einsum("ij,ij->", areas, normals[rows[:, corner]]) for corner in range(3)))
 
 
 def _compact(points: F32, vertices: Index) -> tuple[F32, Index]:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from ...models import SHEET, Behind, Model, model_for
 from ...scene import F64, Material, Mesh, Param, Scene, Source, Sphere
-from ...thickness.solid import is_convex, signed_volume, winding
+from ...thickness.solid import is_convex, winding
+from ..geometry.shapes import INWARDS, TURN
 from .findings import ERROR, WARNING, Finding, Rule
 
 FLAT = 0.2
@@ -62,6 +63,8 @@ class Glass(NamedTuple):
     thickness: Thickness
     has_uv: bool
     """False: a thickness map reads a uv that is not there"""
+    inside_out: bool = False
+    """As authored; here its triangles look outwards"""
     radius: float = 0.0
     """[m]; > 0: an exact sphere"""
 
@@ -91,6 +94,7 @@ def _of_mesh(mesh: Mesh, number: int, scene: Scene) -> Glass:
     return Glass(
         mesh.path, row, row.model, points, triangles, closed, closed and is_convex(points, triangles), sides(points),
         _thickness(row, mesh.primvars, scene), source.texture < 0 or source.uv_primvar in mesh.primvars,
+        mesh.inside_out,
     )  # fmt: skip
 
 
@@ -101,7 +105,8 @@ def _of_sphere(ball: Sphere, scene: Scene) -> Glass:
     source = row.inputs[Param.THICKNESS]
     return Glass(
         ball.path, row, row.model, points, np.zeros((0, 3), np.int64), True, True, (2.0 * ball.radius,) * 3,
-        _thickness(row, ball.primvars, scene), source.texture < 0 or source.uv_primvar in ball.primvars, ball.radius,
+        _thickness(row, ball.primvars, scene), source.texture < 0 or source.uv_primvar in ball.primvars,
+        radius=ball.radius,
     )  # fmt: skip
 
 
@@ -148,16 +153,16 @@ def glass_findings(scene: Scene, glass: list[Glass], unsure: Collection[str] = (
         unsure: materials whose thickness is known to be wrong, so that its size tells nothing
     """
     found: list[Finding] = []
+    turned = {}
     for piece in glass:
         found += _shape(piece)
         if piece.row.name not in unsure:
             found += _lengths(piece, scene.metres_per_unit)
         if not piece.has_uv:
             found.append(_no_uv(piece))
-        inwards = piece.closed and len(piece.triangles) and signed_volume(piece.points, piece.triangles) < 0.0
-        if inwards and not any(_holds(other, piece) for other in glass):
-            found.append(_inside_out(piece))
-    return found
+        if piece.inside_out and piece.path not in turned and not any(_holds(other, piece) for other in glass):
+            turned[piece.path] = _inside_out(piece)
+    return [*found, *turned.values()]
 
 
 def _shape(piece: Glass) -> Iterator[Finding]:
@@ -214,9 +219,8 @@ def _no_uv(piece: Glass) -> Finding:
 
 def _inside_out(piece: Glass) -> Finding:
     """Closed glass whose faces look inwards."""
-    text = "the mesh is closed but its faces look inwards, so light enters where it should leave"
-    fix = "turn its orientation attribute round, or reverse its faces"
-    return INSIDE_OUT.broken(piece.path, text, fix, "orientation")
+    text = f"{INWARDS}; it is drawn turned outwards, but elsewhere light enters where it should leave"
+    return INSIDE_OUT.broken(piece.path, text, TURN, "orientation")
 
 
 def _holds(outer: Glass, inner: Glass) -> bool:
