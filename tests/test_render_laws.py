@@ -18,6 +18,7 @@ from scenes import (
     dome,
     draw,
     glass,
+    light,
     material,
     position_room,
     quad,
@@ -29,7 +30,7 @@ from scenes import (
     where,
 )
 
-from refract_core.scene import Material, Mesh, Model, Probe, Scene, Sphere, Volume
+from refract_core.scene import LightKind, Material, Mesh, Model, Probe, Scene, Sphere, Volume
 
 F32 = NDArray[np.float32]
 
@@ -75,6 +76,39 @@ def test_glass_of_ior_one_is_not_there_for_the_screen(screen: str, tiers: tuple[
     error = np.abs(picture["beauty"] - empty["beauty"]).max(-1)
     assert error[here if screen == "traced" else ...].max() < 0.5 * 5.5 / 64 / 6
     assert np.median(error[here]) < 1e-4
+
+
+FLOOR = quad("/floor", [(-3, -1, 3), (3, -1, 3), (3, -1, -3), (-3, -1, -3)], 0)
+LAMP = light(LightKind.RECT, (0, 1.5, -2.5), (0, -1, 0.8), (1.0, 1.0), 8.0)
+
+
+def test_the_screen_shows_highlights_through_glass_of_ior_one() -> None:
+    """As the eye sees them: the glass turns nothing, so that the pixel that knows a place is the one that asks."""
+    glossy = material("/floor", DIFFUSE=0.2, ROUGHNESS=0.3, IOR=1.8)
+    lens = camera((0, 0.2, 2.4), (0, -0.6, -0.5))
+    pane = box("/pane", (2.0, 2.0, 0.05), 1, centre=(0, 0, 1.5))
+    bare, through = (scene([FLOOR, *meshes], [glossy, glass(Model.TRACED, 1.0)], lights=(LAMP,), cameras=(lens,))
+                     for meshes in ((), (pane,)))  # fmt: skip
+    matt = replace(bare, materials=(material("/floor", DIFFUSE=0.2), bare.materials[1]))
+    empty, picture = draw(bare), draw(through, tiers=("screen",))
+    here = picture["weight.screen"] > 0.999
+    assert here.mean() > 0.3
+    assert (empty["beauty"] - draw(matt)["beauty"])[here].max() > 0.1
+    np.testing.assert_allclose(picture["beauty"][here], empty["beauty"][here], rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize(("roughness", "tier"), [(0.05, "ray"), (0.9, "screen")])
+def test_what_mirrors_is_left_to_rays_where_there_are_any(roughness: float, tier: str) -> None:
+    """Even where so little light comes from it that the screen is good enough for what is matt."""
+    metal = material("/floor", DIFFUSE=0.6, METALLIC=1.0, ROUGHNESS=roughness)
+    dark = glass(Model.TRACED, 1.0, TRANSMITTANCE=0.05, absorption_distance=0.1)
+    pane = box("/pane", (2.0, 2.0, 0.05), 1, centre=(0, 0, 1.5))
+    lens = camera((0, 0.2, 2.4), (0, -0.6, -0.5))
+    what = scene([FLOOR, pane], [metal, dark], lights=(LAMP,), environment=dome(0.5), cameras=(lens,))
+    picture = draw(what, tiers=("screen", "ray", "sky"))
+    on_floor = picture["weight.sky"] < 0.5
+    assert on_floor.mean() > 0.3
+    assert np.median(picture[f"weight.{tier}"][on_floor]) == 1.0
 
 
 def test_glass_of_ior_one_is_not_there_for_a_probe() -> None:

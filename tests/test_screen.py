@@ -1,4 +1,4 @@
-"""The march through a depth buffer, on buffers of known planes."""
+"""The march through a depth buffer, and the light of a place that the picture shows, on buffers of known planes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from refract_core.view.pyramid import (
     new_blur_scratch,
     new_screen_buffers,
 )
-from refract_core.view.screen import march
+from refract_core.view.screen import light_seen, march
 
 F64 = NDArray[np.float64]
 
@@ -73,6 +73,32 @@ def picture_of(planes: list[tuple[ArrayLike, ArrayLike, float]], lens: Camera = 
 
 WALL = ((0, 0, -4), (0, 0, 1), 99.0)
 FLOOR = ((0, -1, 0), (0, 1, 0), 99.0)
+
+
+@kernel
+def _light_seen(screen: Screen, points: F64, facing: F64, out: F64) -> None:
+    for i in range(points.shape[0]):
+        p = (points[i, 0], points[i, 1], points[i, 2])
+        seen = light_seen(screen, p, (facing[0], facing[1], facing[2]))
+        out[i, 0] = 1.0 if seen.known else 0.0
+        for c in range(3):
+            out[i, 1 + c], out[i, 4 + c] = seen.irradiance[c], seen.gloss[c]
+
+
+def seen_at(screen: Screen, points: ArrayLike, facing: ArrayLike = (0, 0, 1)) -> F64:
+    """Rows of (known, irradiance, gloss)."""
+    at = np.atleast_2d(np.asarray(points, np.float64))
+    out = np.empty((len(at), 7))
+    _light_seen(by_address(screen), at, np.asarray(facing, np.float64), out)
+    return out
+
+
+def lit(screen: Screen) -> Screen:
+    """Light that grows along both sides of the picture: as bilinear as what reads it."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    screen.irradiance[:] = np.stack([x, y, x + y], -1)
+    screen.gloss[:] = np.stack([y, x, 2 * x], -1)
+    return screen
 
 
 @pytest.mark.parametrize("lens", [LENS, FLAT], ids=["perspective", "orthographic"])
@@ -146,6 +172,52 @@ def test_a_surface_is_not_hit_from_behind() -> None:
 def test_the_sky_is_missed() -> None:
     found = shoot(picture_of([((0, 0, -3), (0, 0, 1), 0.5)]), (0, 0, -2), [(0.9, 0.3, -1), (0, 0, -1)])
     assert found[:, 0].tolist() == [0, 1]
+
+
+# --- The light of a place -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lens", [LENS, FLAT], ids=["perspective", "orthographic"])
+def test_a_place_in_the_picture_is_lit_as_the_pixels_around_it(lens: Camera) -> None:
+    rng = np.random.default_rng(7)
+    x, y = rng.uniform(1, WIDTH - 2, 200), rng.uniform(1, HEIGHT - 2, 200)
+    far = 1.0 if lens.orthographic else 4.0
+    left, right, bottom, top = lens.window
+    places = np.stack([
+        far * (left + (right - left) * (x + 0.5) / WIDTH), far * (top + (bottom - top) * (y + 0.5) / HEIGHT),
+        np.full(200, -4.0),
+    ], 1)  # fmt: skip
+    found = seen_at(lit(picture_of([WALL], lens)), places)
+    np.testing.assert_allclose(found, np.stack([np.ones(200), x, y, x + y, y, x, 2 * x], 1), rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("place", "facing"),
+    [
+        ((0.3, 0.2, -3.9), (0, 0, 1)), ((0.3, 0.2, -4.1), (0, 0, 1)), ((0.3, 0.2, -4), (0, 0, -1)),
+        ((0.3, 0.2, -4), (0, 0.6, 0.8)), ((40, 0.2, -4), (0, 0, 1)), ((0.3, -40, -4), (0, 0, 1)),
+        ((0, 0, 4), (0, 0, 1)),
+    ],
+    ids=["before", "behind", "back", "slanted", "beside", "below", "behind-the-eye"],
+)  # fmt: skip
+def test_a_place_of_another_surface_is_not_lit(place: tuple[float, ...], facing: tuple[float, ...]) -> None:
+    assert not seen_at(lit(picture_of([WALL])), place, facing).any()
+
+
+def test_at_an_edge_a_surface_is_lit_by_its_own_pixels() -> None:
+    """Beside a card before a wall: the wall has its light as far as pixels show more of it than of the card."""
+    screen = picture_of([WALL, ((0, 0, -2), (0, 0, 1), 0.5)])
+    card = (screen.depth[: WIDTH * HEIGHT] < 3.0).reshape(HEIGHT, WIDTH)
+    screen.irradiance[:] = np.where(card, 9.0, 0.7)[..., None]
+    left, right, *_ = LENS.window
+    pixel = WIDTH / (4.0 * (right - left))  # per metre of wall
+    edge = np.flatnonzero(card[HEIGHT // 2]).max()  # the last pixel of the card in this row
+    past_edge = np.linspace(-3.0, 3.0, 121)  # 0: halfway between the last pixel of the card and the first of the wall
+    x = (edge + 1.0 + past_edge - WIDTH / 2) / pixel
+    found = seen_at(screen, np.stack([x, np.full(121, 0.01), np.full(121, -4.0)], 1))
+    clear = np.abs(past_edge) > 1e-3
+    np.testing.assert_array_equal(found[clear, 0], (past_edge > 0)[clear])
+    np.testing.assert_allclose(found[clear & (past_edge > 0), 1:4], 0.7, rtol=1e-6)
 
 
 # --- Pyramids -------------------------------------------------------------------------------------------------------

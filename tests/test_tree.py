@@ -359,6 +359,18 @@ def test_the_eye_in_water_sees_what_is_with_it_there() -> None:
     assert planes["layers"][0, 0] == 0.0
 
 
+@pytest.mark.parametrize("order", [1, -1])
+def test_of_two_bodies_around_the_eye_the_smaller_fills(order: int) -> None:
+    """Of one priority, and in whichever order the scene names them: the eye has entered the smaller one last."""
+    walls, materials = constant_room()
+    around = [box("/small", (0.2, 0.2, 0.2), 1, centre=(0, 0, 1)), box("/big", (0.6, 0.6, 0.6), 2, centre=(0, 0, 1))]
+    glasses = [glass(Model.TRACED, 1.0, TRANSMITTANCE=tint, absorption_distance=0.1) for tint in (0.6, 0.9)]
+    lens = camera((0, 0, 1), (0, 0, -1), fov=0.01, clipping=(1e-5, 100))
+    planes = draw(scene([*walls, *around[::order]], [*materials, *glasses], cameras=(lens,)), 1, 1, tiers=("ray",))
+    np.testing.assert_allclose(planes["beauty"][0, 0, :3], 0.6**2 * 0.9**4, rtol=1e-3)
+    np.testing.assert_allclose(planes["path_length"], 0.6, rtol=1e-4)
+
+
 # --- Alpha ------------------------------------------------------------------------------------------------------------
 
 
