@@ -33,6 +33,8 @@ TEXEL_LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. ITU-R BT.709
 I16 = np.ndarray[tuple[int, ...], np.dtype[np.int16]]
 I64 = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
+_EVEN = 1e-3
+
 
 class EnvironmentTable(NamedTuple):
     """Arrays of one environment. Without one, the same shape of things in black."""
@@ -40,6 +42,8 @@ class EnvironmentTable(NamedTuple):
     present: bool
     dark: bool
     """it is black all over: it covers what is behind it, and lights nothing"""
+    even: bool
+    """it is the same from everywhere, to a thousandth"""
     pool: F32_2D
     """shape (N, 3): radiance of every level, row by row, level after level"""
     levels: I64_2D
@@ -86,6 +90,7 @@ def pack(environment: Environment | None) -> EnvironmentTable:
     return EnvironmentTable(
         present=environment is not None,
         dark=not pool[-1].any(),  # the last level is the mean of what is never negative
+        even=bool((pixels.max((0, 1)) - pixels.min((0, 1)) <= _EVEN * pixels.max((0, 1))).all()),
         pool=pool,
         levels=levels,
         poles=poles,

@@ -252,6 +252,10 @@ def _sky_direction(environment: EnvironmentTable, n: Vec, key: Key, sample: int)
     Under an even sky the visibility it finds is within 0.01 of the truth; one direction by the radiance more, and none
     by the cosine, would be off by 0.15 before a low wall.
     """
+    if environment.even:
+        # The cosine alone is the density, and one direction keeps the sequence's strata, which a choice would break.
+        u1, u2 = unit_pair(key, sample, Purpose.SKY_COSINE.value)
+        return _cosine_direction(n, u1, u2)
     direction, total = n, 0.0
     pick = unit_pair(key, sample, Purpose.SKY_PICK.value)[0]
     for k in range(_COSINE_CANDIDATES + 1):

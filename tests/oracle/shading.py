@@ -103,11 +103,15 @@ class Shader:
         each brings over the density of all three (Talbot et al. 2005; Veach's balance heuristic)."""
         pick = sampling.pair(key, sample, sampling.SKY_PICK)[0]
         x, y = basis(n)
-        candidates = []
-        for k in range(2):
-            u1, u2 = sampling.pair(key, 2 * sample + k, sampling.SKY_COSINE)
+
+        def by_cosine(number: int) -> Vec:
+            u1, u2 = sampling.pair(key, number, sampling.SKY_COSINE)
             flat = add(scaled(x, math.cos(2.0 * math.pi * u2)), scaled(y, math.sin(2.0 * math.pi * u2)))
-            candidates.append(add(scaled(flat, math.sqrt(u1)), scaled(n, math.sqrt(1.0 - u1))))
+            return add(scaled(flat, math.sqrt(u1)), scaled(n, math.sqrt(1.0 - u1)))
+
+        if sky.even:  # then the cosine is all there is
+            return by_cosine(sample)
+        candidates = [by_cosine(2 * sample), by_cosine(2 * sample + 1)]
         candidates.append(sky.drawn(*sampling.pair(key, sample, sampling.SKY_RADIANCE)))
         chosen, total = n, 0.0
         for candidate in candidates:

@@ -40,6 +40,9 @@ class Sky:
         while len(clean) > 1 or len(clean[0]) > 1:
             clean = resampled(clean, max(len(clean) // 2, 1), max(len(clean[0]) // 2, 1))
             self.levels.append(clean)
+        texels = [texel for row in self.levels[0] for texel in row]
+        self.even = all(max(c) - min(c) <= 1e-3 * max(c) for c in zip(*texels, strict=True))
+        """the same from everywhere"""
         self._known: dict[tuple[int, int], Vec] = {}
 
     # --- Lookups ---
