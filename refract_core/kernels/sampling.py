@@ -55,6 +55,8 @@ class Key(NamedTuple):
     """pixel, or texel of a probe's picture"""
     branch: int
     """0 for what the pixel's own ray meets; see `branched`"""
+    sample: int
+    """which of the pixel's samples"""
 
 
 class Keys(NamedTuple):
@@ -63,24 +65,26 @@ class Keys(NamedTuple):
     x: Words
     y: Words
     branch: Words
+    sample: Words
 
 
 @inlined
 def set_key(keys: Keys, lane: int, key: Key) -> None:
     """Note the key of a lane."""
-    keys.x[lane], keys.y[lane], keys.branch[lane] = key.x, key.y, key.branch
+    keys.x[lane], keys.y[lane] = key.x, key.y
+    keys.branch[lane], keys.sample[lane] = key.branch, key.sample
 
 
 @inlined
 def key_of(keys: Keys, lane: int) -> Key:
     """The key of a lane."""
-    return Key(keys.x[lane], keys.y[lane], keys.branch[lane])
+    return Key(keys.x[lane], keys.y[lane], keys.branch[lane], keys.sample[lane])
 
 
 @inlined
 def branched(key: Key, step: int) -> Key:
     """The key of a ray that follows from one with `key`, by a step of the three."""
-    return Key(key.x, key.y, 4 * key.branch + step)
+    return Key(key.x, key.y, 4 * key.branch + step, key.sample)
 
 
 @inlined
@@ -103,8 +107,8 @@ def chance_of_bits(a: int, b: int, c: int) -> float:
 
 
 @inlined
-def unit_pair(key: Key, sample: int, purpose: int) -> tuple[float, float]:
-    """Point `sample` of the key's own (0,2)-sequence in [0, 1)^2, for one `Purpose`.
+def unit_pair(key: Key, purpose: int) -> tuple[float, float]:
+    """The point of the key's sample in its own (0,2)-sequence in [0, 1)^2, for one `Purpose`.
 
     Every run of 2^m samples that starts at a multiple of 2^m has one point in each box of area 2^-m of a dyadic grid,
     whatever the box's shape. Each dimension is scrambled on its own: without that a pixel's light and its lobe would be
@@ -112,7 +116,7 @@ def unit_pair(key: Key, sample: int, purpose: int) -> tuple[float, float]:
     """
     dimension = _PURPOSES * key.branch + purpose
     u, v = hash32(key.x, key.y, 2 * dimension), hash32(key.x, key.y, 2 * dimension + 1)
-    i = np.uint32(sample)
+    i = np.uint32(key.sample)
     mirrored, bent = np.uint32(1 << 31), np.uint32(1 << 31)
     while i != np.uint32(0):
         if i & np.uint32(1):

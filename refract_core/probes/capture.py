@@ -100,7 +100,7 @@ def capture_rows(
                     if x >= n or y >= y1:
                         continue
                     # Faces lie side by side, and every probe is a branch of its own: no two texels share a sequence.
-                    set_key(block.key, lane, Key(x + n * face, y, shot.seed))
+                    set_key(block.key, lane, Key(x + n * face, y, shot.seed, sample))
                     u = (x + 0.5 + shot.jitter[sample, 0]) / n * 2.0 - 1.0
                     v = (y + 0.5 + shot.jitter[sample, 1]) / n * 2.0 - 1.0
                     if planar:
@@ -116,7 +116,7 @@ def capture_rows(
                     set_ray(packet, lane, centre, scale(d, 1.0 / stretch), start, limit[lane], shot.mask)
                 intersect_world(packet, world, limit, COHERENT)
                 load_hits(block, packet, world, spread)
-                shade(block, second, packet, world, sample, shot.mask)
+                shade(block, second, packet, world, shot.mask)
                 _keep_texels(table, shot, face, block, bx, by, y1)
     return packet.tally[0]
 

@@ -13,8 +13,9 @@ from ..scene import Camera, Scene
 from ..settings import SCREEN_METHODS, TIERS, RenderSettings
 from ..transport.crossing import Rules
 from ..transport.eye import view_ray
+from ..transport.pixels import tree_tile
 from ..transport.tiers import Asking
-from ..transport.tree import TreeScratch, tree_tile
+from ..transport.tree import TreeScratch
 from ..view.camera import Tile, View
 from ..view.gbuffer import OpaqueLayer, ViewScratch, opaque_tile
 from ..view.planes import Planes

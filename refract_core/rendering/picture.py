@@ -20,7 +20,7 @@ from ..models import BY_TOKEN, SHEET, Behind
 from ..progress import COMPILING
 from ..scene import Camera, Notice, Scene
 from ..settings import RenderSettings
-from ..transport.tree import tree_tile
+from ..transport.pixels import tree_tile
 from ..version import __version__
 from ..view.camera import image_size, view_of
 from ..view.planes import by_name, finish_of, finish_tile, new_planes

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..kernels.compile import inlined
 from ..kernels.lanes import Column, Flags, Scalars, Vectors, Words, put
-from ..kernels.sampling import GLANCED, THROUGH
+from ..kernels.sampling import GLANCED, THROUGH, hash32
 from ..kernels.vec import Vec, dot, flip_towards, mul, normalize, row, scale, sub
 from ..optics.interface import fresnel_dielectric, reflect, refract, transmittance, transmitted_roughness
 from ..optics.models import absorption_distance_of, exit_of, is_sheet, is_walked, on_open_mesh, thickness_of
@@ -349,6 +349,7 @@ def _follow(to: Rays, i: int, now: Rays, lane: int, meeting: Meeting, step: int)
     to.lost[i] = 1 if to.met[i] >= MOST_MET else 0
     to.travelled[i] += meeting.t[lane]
     to.branch[i] = 4 * now.branch[lane] + step
+    to.way[i] = np.int32(hash32(now.way[lane], 4 * meeting.thing[lane] + step, 4 * meeting.kind[lane]))
     to.roughness[i] = max(now.roughness[lane], meeting.roughness[lane])
     if meeting.kind[lane] != LEFT:
         put(to.normal, i, row(meeting.n, lane))
@@ -391,6 +392,7 @@ def send_through(to: Rays, i: int, now: Rays, lane: int, meeting: Meeting, rules
         put(to.clear, i, row(meeting.clear, lane))
         if count == 3:
             to.channel[i] = c
+            to.way[i] = np.int32(hash32(to.way[i], c, 1))
             for other in range(3):
                 if other != c:
                     to.weight[i, other] = to.clear[i, other] = 0.0

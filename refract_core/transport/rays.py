@@ -84,6 +84,8 @@ class Rays(NamedTuple):
     """within its cell"""
     branch: I32_1D
     """of the sampling sequence"""
+    way: I32_1D
+    """a number for the surfaces it came by, and how it left each"""
     channel: I32_1D
     """ALL_CHANNELS, or the one that it is left with after dispersion"""
     side: I32_1D
@@ -134,6 +136,7 @@ def copy_ray(to: Rays, i: int, rays: Rays, j: int) -> None:
     to.blur[i], to.roughness[i], to.path[i] = rays.blur[j], rays.roughness[j], rays.path[j]
     to.travelled[i] = rays.travelled[j]
     to.inner[i], to.pixel[i], to.branch[i] = rays.inner[j], rays.pixel[j], rays.branch[j]
+    to.way[i] = rays.way[j]
     to.channel[i], to.side[i], to.thing[i] = rays.channel[j], rays.side[j], rays.thing[j]
     to.entered[i], to.met[i], to.lost[i] = rays.entered[j], rays.met[j], rays.lost[j]
     to.media.depth[i] = rays.media.depth[j]

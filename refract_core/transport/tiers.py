@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..kernels.arrays import I32_1D
 from ..kernels.compile import flag, inlined
-from ..kernels.lanes import LANES, Column, Flags, Scalars, Vectors, Words
+from ..kernels.lanes import LANES, Column, Flags, Scalars, Vectors, Words, put
 from ..kernels.sampling import Keys, Purpose, key_of, set_key, unit_pair
 from ..kernels.vec import Vec, add, flip_towards, frame, mul, normalize, row, scale
 from ..optics.interface import screen_lod_hdrp
@@ -79,6 +79,14 @@ class Query(NamedTuple):
     """screen, ray, probe, sky, none; sums to 1"""
     confidence: Scalars
 
+    # The surface, where it is known; `corners` looks at its texture anew.
+    surface_share: Scalars
+    """weight with which it has answered by what follows, 0 .. 1"""
+    emissive: Vectors
+    """radiance"""
+    albedo: Vectors
+    irradiance: Vectors
+
 
 class Asking(NamedTuple):
     """Who is asked, and in which order: the same for every ray of a picture."""
@@ -140,7 +148,7 @@ def _headroom(query: Query, lane: int) -> float:
 
 
 @inlined
-def ask(query: Query, asking: Asking, work: TierScratch, world: World, sample: int) -> None:
+def ask(query: Query, asking: Asking, work: TierScratch, world: World) -> None:
     """Fill colour, weight and confidence of every lane that is on."""
     inside = False
     for lane in range(LANES):
@@ -149,15 +157,15 @@ def ask(query: Query, asking: Asking, work: TierScratch, world: World, sample: i
         for k in range(5):
             query.weight[lane, k] = 0.0
         query.weight[lane, NONE] = 1.0
-        query.confidence[lane] = 0.0
+        query.confidence[lane] = query.surface_share[lane] = 0.0
         inside = inside or (query.on[lane] != 0 and query.embedded[lane] != 0)
     if inside:  # what lies inside the glass is near, and known to be met: nobody can guess it better than a ray
-        _ask_rays(query, EMBEDDED_ONLY, work, world, sample)
+        _ask_rays(query, EMBEDDED_ONLY, work, world)
     order = asking.order
     for i in range(order.shape[0]):
         tier = order[i]
         if tier == RAY:
-            _ask_rays(query, ALL_RAYS, work, world, sample)
+            _ask_rays(query, ALL_RAYS, work, world)
             continue
         sky_follows = False
         for j in range(i + 1, order.shape[0]):
@@ -222,8 +230,18 @@ def _ask_screen_traced(query: Query, lane: int, asking: Asking, work: TierScratc
         _add_covered(query, lane, SCREEN, (r, g, b), coverage, _headroom(query, lane), 1.0)
         return
     load_surface(surface, lane, at, world, scale(d, -1.0))
+    _note_surface(query, lane, surface, seen.irradiance)
     lit = scale(mul(row(surface.albedo, lane), seen.irradiance), 1.0 / math.pi)
     _add(query, lane, SCREEN, add(add(row(surface.emissive, lane), lit), seen.gloss), _headroom(query, lane), 1.0)
+
+
+@inlined
+def _note_surface(query: Query, lane: int, surface: Block, irradiance: Vec) -> None:
+    """Say what the surface is like that answers for all that is left."""
+    query.surface_share[lane] = _headroom(query, lane)
+    put(query.emissive, lane, row(surface.emissive, lane))
+    put(query.albedo, lane, row(surface.albedo, lane))
+    put(query.irradiance, lane, irradiance)
 
 
 @inlined
@@ -254,7 +272,7 @@ def _ask_probe(query: Query, lane: int, k: int, probes: ProbeTable, world: World
 
 
 @inlined
-def _ask_rays(query: Query, embedded: bool, work: TierScratch, world: World, sample: int) -> None:
+def _ask_rays(query: Query, embedded: bool, work: TierScratch, world: World) -> None:
     """Light of what every lane with weight left meets; `embedded` lanes only, or all. A cone sends a ray of its own."""
     packet, second = work.packet, work.second
     clear(packet)
@@ -270,7 +288,7 @@ def _ask_rays(query: Query, embedded: bool, work: TierScratch, world: World, sam
         if query.blur[lane] > 0.0:
             scatters = True
             work.sent[lane] = 1
-            u1, u2 = unit_pair(key, sample, Purpose.ROUGH_LEAF.value)
+            u1, u2 = unit_pair(key, Purpose.ROUGH_LEAF.value)
             d = _scatter(row(query.direction, lane), query.blur[lane], u1, u2)
             work.far[lane] = math.inf
             set_ray(packet, lane, row(query.origin, lane), d, 0.0, math.inf, OPAQUE)
@@ -290,9 +308,11 @@ def _ask_rays(query: Query, embedded: bool, work: TierScratch, world: World, sam
             at = interaction(world.geometry, kept_hit(query.met, lane), ray, query.width[lane])
             second.on[lane] = 1
             load_surface(second, lane, at, world, scale(d, -1.0))
-    shade(second, work.third, packet, world, sample, OPAQUE)
+    shade(second, work.third, packet, world, OPAQUE)
     for lane in range(LANES):
         if second.on[lane] != 0:
+            if work.sent[lane] == 2:
+                _note_surface(query, lane, second, row(second.diffuse, lane))
             _add(query, lane, RAY, row(second.color, lane), _headroom(query, lane), 1.0)
 
 

@@ -1,9 +1,9 @@
-"""The light of pixels that see glass: a tree of rays for each, followed packet by packet (docs/decisions/one-tree.md).
+"""The light of view rays that see glass: a tree of rays for each, packet by packet (docs/decisions/one-tree.md).
 
-A tile is done in cells of 8x8 pixels. The rays of a cell wait on a stack: the eight on top travel as a packet, what
-goes on from them is put back on top, mirrored rays below those that go through. So the stack stays short however long
-the paths, and the rays of a packet are neighbours. Rays that end are leaves; they wait in a list, and ask the tiers in
-packets of their own. Nothing depends on the tile, so its size does not show.
+View rays are followed in cells of at most 64; `pixels` and `corners` say which. The rays of a cell wait on a stack: the
+eight on top travel as a packet, what goes on from them is put back on top, mirrored rays below those that go through.
+So the stack stays short however long the paths, and the rays of a packet are neighbours. Rays that end are leaves; they
+wait in a list, and ask the tiers in packets of their own. What a view ray comes to does not depend on its cell.
 """
 
 from __future__ import annotations
@@ -14,21 +14,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..kernels.arrays import F64_1D, F64_2D, I32_1D
-from ..kernels.compile import inlined, kernel
-from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Flags, Scalars, new_lanes, put
+from ..kernels.compile import inlined
+from ..kernels.lanes import LANES, Flags, Scalars, new_lanes, put
 from ..kernels.sampling import Key, set_key
-from ..kernels.vec import along, dot, row, scale
+from ..kernels.vec import Vec, add, along, dot, flip_towards, mul, row, scale
 from ..scene import Model
-from ..view.camera import Tile, View, pixel_ray
-from ..view.gbuffer import OpaqueLayer
-from ..view.planes import Planes
+from ..view.camera import View, pixel_ray
 from ..world.embree import COHERENT, EVERYTHING, OPAQUE, SCATTERED, Packet, clear, has_hit, set_ray
-from ..world.environment import TEXEL_LUMINANCE
+from ..world.environment import TEXEL_LUMINANCE, radiance
 from ..world.offsets import tie
 from ..world.shading import Block, gather, load_surface
 from ..world.surface import NOTHING, HitLanes, Ray, hit_in, interaction, keep_hit, kept_hit
 from ..world.tables import World
 from ..world.tracing import intersect_world
+from .answers import Answers, add_answer, add_glow, new_answers
 from .crossing import (
     LEFT,
     MOST_MET,
@@ -43,14 +42,15 @@ from .crossing import (
     send_through,
 )
 from .rays import MIRRORED_SIDE, THROUGH_SIDE, VIEW, Rays, absorb, copy_ray, new_rays
-from .tiers import NONE, PROBE, PROXY, RAY, SCREEN, SKY, Asking, Query, TierScratch, ask
+from .tiers import NONE, PROXY, Asking, Query, TierScratch, ask
 
-CELL = 8
-"""Pixels along the side of a cell."""
-_PIXELS = CELL * CELL
+CELL = 64
+"""View rays that are followed together."""
 # A packet takes eight rays off the stack and puts back two for each, or four where one splits into its colours, which
 # happens once on a way. It does so at most as often as rays may meet glass, which bounds the stack.
-_STACK = _PIXELS + 4 * LANES * (MOST_MET + 2)
+_STACK = CELL + 4 * LANES * (MOST_MET + 2)
+SLOTS = 33 * 33
+"""As many as a patch of 32x32 pixels has corners."""
 _LEAVES = 256
 _STRONG = 0.1
 """Weight of a leaf above which its light is worth rays of its own."""
@@ -60,8 +60,12 @@ _ENDED, _MET, _PASSED_OUT, _NO_RAY = 0, 1, 2, 3
 
 
 class Cell(NamedTuple):
-    """Sums of one sample over a cell; N is 64 pixels, row by row."""
+    """What N view rays have come to: sums over their leaves. Each has a slot."""
 
+    x: I32_1D
+    """of the pixel, or corner, whose sampling sequence a view ray follows"""
+    y: I32_1D
+    sample: I32_1D
     color: F64_2D
     """shape (N, 3)"""
     missing: F64_1D
@@ -117,6 +121,11 @@ class TreeScratch(NamedTuple):
     """what is opaque that each leaf has met"""
     cell: Cell
 
+    answers: Answers
+    """what the leaves of each slot were answered; kept for `corners` alone"""
+    block_of_one: Block
+    """a surface that is looked up for itself"""
+
     @staticmethod
     def fresh() -> TreeScratch:
         """All of it at zero."""
@@ -124,105 +133,76 @@ class TreeScratch(NamedTuple):
         return TreeScratch(
             new_lanes(TierScratch), new_lanes(Packet), new_lanes(Block), new_lanes(Meeting), new_lanes(HitLanes),
             np.zeros(LANES, np.int32), np.zeros(LANES), new_lanes(Query), new_rays(LANES), new_rays(_STACK),
-            new_rays(_LEAVES), HitLanes(*(np.zeros(_LEAVES, kind) for kind in kinds)), _new_cell(),
+            new_rays(_LEAVES), HitLanes(*(np.zeros(_LEAVES, kind) for kind in kinds)), _new_cell(SLOTS),
+            new_answers(SLOTS), new_lanes(Block),
         )  # fmt: skip
 
 
-def _new_cell() -> Cell:
+def _new_cell(count: int) -> Cell:
     columns = {"color": 3, "refraction": 3, "reflection": 3, "weight": 3, "clear": 3, "tiers": 5, "normal": 3}
 
     def array(name: str) -> Any:
-        if name in ("entered", "glass"):
-            return np.zeros(_PIXELS, np.int32)
-        return np.zeros((_PIXELS, columns[name])) if name in columns else np.zeros(_PIXELS)
+        if name in ("x", "y", "sample", "entered", "glass"):
+            return np.zeros(count, np.int32)
+        return np.zeros((count, columns[name])) if name in columns else np.zeros(count)
 
     return Cell(*(array(name) for name in Cell._fields))
 
 
-# --- a tile -------------------------------------------------------------------------------------------------------
+# --- following ----------------------------------------------------------------------------------------------------
 
 
-@kernel
-def tree_tile(
-    world: World,
-    asking: Asking,
-    rules: Rules,
-    view_ray: Rays,
-    scratch: TreeScratch,
-    tile: Tile,
-    sample: int,
-    opaque: OpaqueLayer,
-    planes: Planes,
+@inlined
+def start(
+    scratch: TreeScratch, view: View, view_ray: Rays, count: int, slot: int, px: float, py: float, key: Key
 ) -> int:
-    """Add one sample of a tile to `planes`: trees where there is glass, the opaque picture elsewhere.
+    """Put the view ray through a pixel coordinate on the stack of `count` rays, and clear its slot.
 
     Args:
         view_ray: one row, what every view ray starts as (`eye.view_ray`).
 
     Returns:
-        Rays traced.
+        The stack's new height.
     """
-    view = asking.screen.camera
-    scratch.packet.tally[0] = scratch.work.packet.tally[0] = 0
-    for y0 in range(tile[1], tile[3], CELL):
-        for x0 in range(tile[0], tile[2], CELL):
-            count = _start(scratch, view, view_ray, opaque, x0, y0)
-            if count > 0:
-                _follow_all(scratch, world, asking, rules, sample, x0, y0, count)
-            _add_cell(planes, scratch.cell, opaque, view, x0, y0, sample)
-    return scratch.packet.tally[0] + scratch.work.packet.tally[0]
+    stack, cell = scratch.stack, scratch.cell
+    clear_slot(cell, slot)
+    cell.x[slot], cell.y[slot], cell.sample[slot] = key.x, key.y, key.sample
+    origin, direction, cosine = pixel_ray(view, px, py)
+    copy_ray(stack, count, view_ray, 0)
+    put(stack.origin, count, origin)
+    put(stack.direction, count, direction)
+    stack.start[count] = view.clipping[0] / cosine
+    stack.end[count] = view.clipping[1] / cosine
+    stack.pixel[count] = slot
+    if view_ray.media.depth[0] > 0:
+        cell.glass[slot] = 1
+    return count + 1
 
 
 @inlined
-def _start(scratch: TreeScratch, view: View, view_ray: Rays, opaque: OpaqueLayer, x0: int, y0: int) -> int:
-    """Put the view rays of a cell that see glass on the stack, block by block. Returns how many."""
-    cell, stack = scratch.cell, scratch.stack
-    _clear(cell)
-    count = 0
-    for k in range(_PIXELS):
-        block, lane = k // LANES, k % LANES
-        i = block % (CELL // BLOCK_WIDTH) * BLOCK_WIDTH + lane % BLOCK_WIDTH
-        j = block // (CELL // BLOCK_WIDTH) * BLOCK_HEIGHT + lane // BLOCK_WIDTH
-        x, y = x0 + i, y0 + j
-        if x >= view.size[0] or y >= view.size[1]:
-            continue
-        submerged = view_ray.media.depth[0] > 0
-        if opaque.glass[y, x] == 0 and not submerged:
-            continue
-        origin, direction, cosine = pixel_ray(view, x + 0.5, y + 0.5)
-        copy_ray(stack, count, view_ray, 0)
-        put(stack.origin, count, origin)
-        put(stack.direction, count, direction)
-        stack.start[count] = view.clipping[0] / cosine
-        stack.end[count] = view.clipping[1] / cosine
-        stack.pixel[count] = j * CELL + i
-        if submerged:
-            cell.glass[j * CELL + i] = 1
-            cell.z_depth[j * CELL + i] = opaque.depth[y, x]
-            put(cell.normal, j * CELL + i, row(opaque.normal[y], x))
-        count += 1
-    return count
+def clear_slot(cell: Cell, i: int) -> None:
+    """Nothing seen yet."""
+    for c in range(3):
+        cell.color[i, c] = cell.refraction[i, c] = cell.reflection[i, c] = 0.0
+        cell.weight[i, c] = cell.clear[i, c] = cell.normal[i, c] = 0.0
+    for k in range(5):
+        cell.tiers[i, k] = 0.0
+    cell.missing[i] = cell.confidence[i] = cell.share[i] = cell.largest[i] = cell.path[i] = 0.0
+    cell.entered[i] = cell.glass[i] = 0
+    cell.z_depth[i] = math.inf
+    cell.thickness[i] = 0.0
 
 
 @inlined
-def _clear(cell: Cell) -> None:
-    for i in range(_PIXELS):
-        for c in range(3):
-            cell.color[i, c] = cell.refraction[i, c] = cell.reflection[i, c] = 0.0
-            cell.weight[i, c] = cell.clear[i, c] = 0.0
-        for k in range(5):
-            cell.tiers[i, k] = 0.0
-        cell.missing[i] = cell.confidence[i] = cell.share[i] = cell.largest[i] = cell.path[i] = 0.0
-        cell.entered[i] = cell.glass[i] = 0
-        cell.z_depth[i] = math.inf
-        cell.thickness[i] = 0.0
-
-
-@inlined
-def _follow_all(
-    scratch: TreeScratch, world: World, asking: Asking, rules: Rules, sample: int, x0: int, y0: int, count: int
+def follow(
+    scratch: TreeScratch, world: World, asking: Asking, rules: Rules, view: View, count: int, alone: bool
 ) -> None:
-    """Follow the rays on the stack, and what becomes of them, to their leaves, and ask those."""
+    """Follow the `count` rays on the stack, and what becomes of them, to their leaves, and ask those.
+
+    Args:
+        view: whose rays they are; its spread is theirs.
+        alone: draw what is opaque and seen without any glass, too; otherwise somebody else has drawn that.
+    """
     stack = scratch.stack
     leaves = 0
     while count > 0:
@@ -231,8 +211,8 @@ def _follow_all(
         for lane in range(taken):
             copy_ray(scratch.now, lane, stack, count + lane)
         _trace(scratch, world, rules, taken)
-        _meet_all(scratch, world, asking, rules, taken)
-        _shine(scratch, world, asking, sample, x0, y0, taken)
+        _meet_all(scratch, world, view, rules, taken)
+        _shine(scratch, world, taken)
         for lane in range(taken):
             if scratch.state[lane] == _ENDED:
                 copy_ray(scratch.leaves, leaves, scratch.now, lane)
@@ -240,9 +220,9 @@ def _follow_all(
                 leaves += 1
         count = _send_all(scratch, rules, count, taken)
         if leaves > _LEAVES - LANES:
-            _ask_all(scratch, world, asking, sample, x0, y0, leaves)
+            _ask_all(scratch, world, asking, view, leaves, alone)
             leaves = 0
-    _ask_all(scratch, world, asking, sample, x0, y0, leaves)
+    _ask_all(scratch, world, asking, view, leaves, alone)
 
 
 @inlined
@@ -295,10 +275,9 @@ def _trace(scratch: TreeScratch, world: World, rules: Rules, taken: int) -> None
 
 
 @inlined
-def _meet_all(scratch: TreeScratch, world: World, asking: Asking, rules: Rules, taken: int) -> None:
+def _meet_all(scratch: TreeScratch, world: World, view: View, rules: Rules, taken: int) -> None:
     """Say what has become of the packet's rays: the end, an interface, something to pass, a model's exit."""
     now, met, meeting, cell = scratch.now, scratch.met, scratch.meeting, scratch.cell
-    view = asking.screen.camera
     for lane in range(LANES):
         scratch.state[lane] = _NO_RAY
         scratch.block.on[lane] = 0
@@ -314,6 +293,8 @@ def _meet_all(scratch: TreeScratch, world: World, asking: Asking, rules: Rules, 
         if world.materials.model[hit.material] == Model.NONE.value:
             absorb(now, lane, hit.t)
             scratch.state[lane] = _ENDED
+            if now.side[lane] == VIEW:
+                _note_opaque(scratch, world, view, lane)
             continue
         first = now.side[lane] == VIEW
         direction = row(now.direction, lane)
@@ -340,9 +321,17 @@ def _meet_all(scratch: TreeScratch, world: World, asking: Asking, rules: Rules, 
 
 
 @inlined
-def _shine(
-    scratch: TreeScratch, world: World, asking: Asking, sample: int, x0: int, y0: int, taken: int
-) -> None:
+def _note_opaque(scratch: TreeScratch, world: World, view: View, lane: int) -> None:
+    """Where a view ray ends without having met any interface."""
+    now, hit = scratch.now, kept_hit(scratch.met, lane)
+    direction, i = row(now.direction, lane), now.pixel[lane]
+    scratch.cell.z_depth[i] = hit.t * dot(direction, row(view.axes, 2))
+    at = interaction(world.geometry, hit, Ray(row(now.origin, lane), direction), 0.0)
+    put(scratch.cell.normal, i, flip_towards(at.ng, scale(direction, -1.0)))
+
+
+@inlined
+def _shine(scratch: TreeScratch, world: World, taken: int) -> None:
     """Add what the entered surfaces send out themselves: the part of them that is not clear, and lights' highlights."""
     now, block, cell, opacities = scratch.now, scratch.block, scratch.cell, scratch.meeting.opacity
     some = False
@@ -350,24 +339,35 @@ def _shine(
         if block.on[lane] != 0:
             some = True
             i = now.pixel[lane]
-            set_key(block.key, lane, Key(x0 + i % CELL, y0 + i // CELL, now.branch[lane]))
+            set_key(block.key, lane, Key(cell.x[i], cell.y[i], now.branch[lane], cell.sample[i]))
     if not some:
         return
-    gather(block, scratch.packet, world, sample, OPAQUE)
+    gather(block, scratch.packet, world, OPAQUE)
     for lane in range(taken):
         if block.on[lane] == 0:
             continue
         i, side = now.pixel[lane], now.side[lane]
-        for c in range(3):
-            w = now.weight[lane, c]
-            gloss = w * block.specular[lane, c]
-            body = block.emissive[lane, c] + block.albedo[lane, c] * block.diffuse[lane, c] / math.pi
-            body *= w * opacities[lane]
-            cell.color[i, c] += gloss + body
-            if side == THROUGH_SIDE:
-                cell.refraction[i, c] += gloss + body
-            else:
-                cell.reflection[i, c] += gloss if side == VIEW else gloss + body
+        w, share = row(now.weight, lane), opacities[lane]
+        gloss = mul(w, row(block.specular, lane))
+        lit = scale(mul(row(block.albedo, lane), row(block.diffuse, lane)), 1.0 / math.pi)
+        body = scale(mul(w, add(row(block.emissive, lane), lit)), share)
+        _glow(scratch, i, gloss, MIRRORED_SIDE if side == VIEW else side, now.way[lane], 1)
+        _glow(scratch, i, body, side, now.way[lane], 2)
+
+
+@inlined
+def _glow(scratch: TreeScratch, i: int, light: Vec, side: int, way: int, what: int) -> None:
+    """Add light that a surface of glass sends out itself."""
+    if light[0] == 0.0 and light[1] == 0.0 and light[2] == 0.0:
+        return
+    cell = scratch.cell
+    for c in range(3):
+        cell.color[i, c] += light[c]
+        if side == THROUGH_SIDE:
+            cell.refraction[i, c] += light[c]
+        elif side == MIRRORED_SIDE:
+            cell.reflection[i, c] += light[c]
+    add_glow(scratch.answers, i, light, side, way, what)
 
 
 @inlined
@@ -393,29 +393,36 @@ def _send_all(scratch: TreeScratch, rules: Rules, count: int, taken: int) -> int
 
 @inlined
 def _ask_all(
-    scratch: TreeScratch, world: World, asking: Asking, sample: int, x0: int, y0: int, leaves: int
+    scratch: TreeScratch, world: World, asking: Asking, view: View, leaves: int, alone: bool
 ) -> None:
-    """Ask the tiers for the light of the leaves in the list, and add it to their pixels."""
+    """Ask the tiers for the light of the leaves in the list, and add it to their slots."""
     query = scratch.query
     for first in range(0, leaves, LANES):
         for lane in range(LANES):
             query.on[lane] = 0
             if first + lane < leaves:
-                _load_query(scratch, asking, x0, y0, first + lane, lane)
-        ask(query, asking, scratch.work, world, sample)
+                _load_query(scratch, world, asking, view, first + lane, lane, alone)
+        ask(query, asking, scratch.work, world)
         for lane in range(min(LANES, leaves - first)):
             if query.on[lane] != 0:
-                _add_leaf(scratch.cell, scratch.leaves, query, first + lane, lane, asking.screen.camera)
+                _add_leaf(scratch, world, first + lane, lane, view)
 
 
 @inlined
-def _load_query(scratch: TreeScratch, asking: Asking, x0: int, y0: int, k: int, lane: int) -> None:
+def _load_query(
+    scratch: TreeScratch, world: World, asking: Asking, view: View, k: int, lane: int, alone: bool
+) -> None:
     query, leaves, cell = scratch.query, scratch.leaves, scratch.cell
     i = leaves.pixel[k]
-    if cell.glass[i] == 0:  # it met nothing but what it passed: the opaque picture has it
+    seen = scratch.leaf_hits.part[k] != NOTHING
+    direct = cell.glass[i] == 0  # it met nothing but what it passed
+    if direct and not alone:
+        return
+    if direct and not seen:
+        _add_background(cell, i, world, row(leaves.direction, k))
         return
     query.on[lane] = 1
-    set_key(query.key, lane, Key(x0 + i % CELL, y0 + i // CELL, leaves.branch[k]))
+    set_key(query.key, lane, Key(cell.x[i], cell.y[i], leaves.branch[k], cell.sample[i]))
     query.z_self[lane] = cell.z_depth[i]
     put(query.origin, lane, row(leaves.origin, k))
     put(query.direction, lane, row(leaves.direction, k))
@@ -423,17 +430,26 @@ def _load_query(scratch: TreeScratch, asking: Asking, x0: int, y0: int, k: int, 
     query.blur[lane] = leaves.blur[k]
     query.roughness[lane] = leaves.roughness[k]
     query.thing[lane] = leaves.thing[k]
-    query.width[lane] = asking.screen.camera.spread * (leaves.travelled[k] + scratch.leaf_hits.t[k])
+    query.width[lane] = view.spread * (leaves.travelled[k] + scratch.leaf_hits.t[k])
     keep_hit(query.met, lane, kept_hit(scratch.leaf_hits, k))
-    inside = leaves.media.depth[k] > 0 and scratch.leaf_hits.part[k] != NOTHING
-    query.embedded[lane] = 1 if inside else 0
+    inside = leaves.media.depth[k] > 0 and seen
+    query.embedded[lane] = 1 if inside or direct else 0
     strongest = max(leaves.weight[k, 0], leaves.weight[k, 1], leaves.weight[k, 2])
     query.strong[lane] = 1 if strongest > _STRONG else 0
     query.by_proxy[lane] = 1 if asking.method == PROXY and leaves.side[k] != MIRRORED_SIDE else 0
 
 
 @inlined
-def _add_leaf(cell: Cell, leaves: Rays, query: Query, k: int, lane: int, view: View) -> None:
+def _add_background(cell: Cell, i: int, world: World, direction: Vec) -> None:
+    """The sky as a view ray sees it, or nothing."""
+    cell.missing[i] = 0.0 if world.environment.present else 1.0
+    if world.environment.present:
+        put(cell.color, i, add(row(cell.color, i), radiance(world.environment, direction, 0.0)))
+
+
+@inlined
+def _add_leaf(scratch: TreeScratch, world: World, k: int, lane: int, view: View) -> None:
+    cell, leaves, query = scratch.cell, scratch.leaves, scratch.query
     i = leaves.pixel[k]
     unanswered = max(0.0, query.weight[lane, NONE])
     mean = share = 0.0
@@ -451,6 +467,7 @@ def _add_leaf(cell: Cell, leaves: Rays, query: Query, k: int, lane: int, view: V
             cell.clear[i, c] += leaves.clear[k, c]
     if dot(row(leaves.direction, k), row(view.axes, 2)) > 0.0:  # it would have seen a background
         cell.missing[i] += mean * unanswered
+    add_answer(scratch.answers, i, leaves, k, query, lane, world)
     if leaves.side[k] == MIRRORED_SIDE:
         return
     for tier in range(4):
@@ -465,50 +482,3 @@ def _add_leaf(cell: Cell, leaves: Rays, query: Query, k: int, lane: int, view: V
         cell.largest[i] = bright
         cell.path[i] = leaves.path[k]
         cell.entered[i] = leaves.entered[k]
-
-
-# --- pixels -------------------------------------------------------------------------------------------------------
-
-
-@inlined
-def _add_cell(planes: Planes, cell: Cell, opaque: OpaqueLayer, view: View, x0: int, y0: int, sample: int) -> None:
-    """Add a cell's sums to the planes, and the opaque picture where there is no glass."""
-    for i in range(_PIXELS):
-        x, y = x0 + i % CELL, y0 + i // CELL
-        if x >= view.size[0] or y >= view.size[1]:
-            continue
-        if sample == 0:
-            planes.z_depth[y, x] = opaque.depth[y, x]
-            for c in range(3):
-                planes.normal[y, x, c] = opaque.normal[y, x, c]
-        if cell.glass[i] == 0:
-            for c in range(4):
-                planes.beauty[y, x, c] += opaque.color[y, x, c]
-        else:
-            _add_glass(planes, cell, i, x, y, sample)
-
-
-@inlined
-def _add_glass(planes: Planes, cell: Cell, i: int, x: int, y: int, sample: int) -> None:
-    share = cell.share[i]
-    for c in range(3):
-        planes.beauty[y, x, c] += cell.color[i, c]
-        planes.refraction[y, x, c] += cell.refraction[i, c]
-        planes.reflection[y, x, c] += cell.reflection[i, c]
-        planes.transmittance[y, x, c] += cell.weight[i, c] / cell.clear[i, c] if cell.clear[i, c] > 0.0 else 1.0
-    planes.beauty[y, x, 3] += 1.0 - cell.missing[i]
-    planes.mask[y, x] += 1.0
-    if share > 0.0:
-        planes.screen[y, x] += cell.tiers[i, SCREEN] / share
-        planes.ray[y, x] += cell.tiers[i, RAY] / share
-        planes.probe[y, x] += cell.tiers[i, PROBE] / share
-        planes.sky[y, x] += cell.tiers[i, SKY] / share
-        planes.none[y, x] += cell.tiers[i, NONE] / share
-        planes.confidence[y, x] += cell.confidence[i] / share
-    if sample == 0:
-        planes.thickness[y, x] = cell.thickness[i]
-        planes.path_length[y, x] = cell.path[i]
-        planes.layers[y, x] = cell.entered[i]
-        planes.z_depth[y, x] = cell.z_depth[i]
-        for c in range(3):
-            planes.normal[y, x, c] = cell.normal[i, c]

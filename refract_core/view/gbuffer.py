@@ -92,7 +92,7 @@ def opaque_tile(
                 x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
                 if x < width and y < height:
                     far[lane] = add_view_ray(packet, view, lane, x, y, EVERYTHING)
-                    set_key(block.key, lane, Key(x, y, 0))
+                    set_key(block.key, lane, Key(x, y, 0, sample))
             intersect_world(packet, world, far, COHERENT)
             behind = False
             for lane in range(LANES):
@@ -107,7 +107,7 @@ def opaque_tile(
             if behind:
                 _trace_behind_glass(scratch, world, view, x0, y0)
             load_hits(block, packet, world, view.spread)
-            shade(block, scratch.second, packet, world, sample, OPAQUE)
+            shade(block, scratch.second, packet, world, OPAQUE)
             _write_opaque(layer, block, world, view, x0, y0)
     return packet.tally[0], glass
 

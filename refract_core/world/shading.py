@@ -165,7 +165,7 @@ def _fresnel(f0: Vec, roughness: float, cosine: float) -> Vec:
 
 
 @inlined
-def _gather_lights(block: Block, packet: Packet, world: World, sample: int, mask: int) -> None:
+def _gather_lights(block: Block, packet: Packet, world: World, mask: int) -> None:
     """Add every light's irradiance to `diffuse` and its highlights to `specular`, with shadows."""
     lights = world.lights
     for lane in range(LANES):
@@ -187,7 +187,7 @@ def _gather_lights(block: Block, packet: Packet, world: World, sample: int, mask
             # A clear coat has a highlight of its own, where the rest of the surface may have none.
             arrives = block.lamp_diffuse[lane] + block.lamp_specular[lane] > 0.0 or block.coat[lane] > 0.0
             if arrives and lights.casts_shadow[l] != 0:
-                u1, u2 = unit_pair(key_of(block.key, lane), sample, Purpose.LIGHT.value + l)
+                u1, u2 = unit_pair(key_of(block.key, lane), Purpose.LIGHT.value + l)
                 direction, distance = shadow_ray(lights, l, p, u1, u2)
                 add_shadow_ray(packet, lane, p, row(block.ng, lane), direction, distance)
         if lights.casts_shadow[l] != 0:
@@ -216,7 +216,7 @@ def _add_light(block: Block, lights: LightTable, l: int) -> None:  # noqa: E741
 
 
 @inlined
-def _gather_sky(block: Block, packet: Packet, world: World, sample: int, mask: int) -> None:
+def _gather_sky(block: Block, packet: Packet, world: World, mask: int) -> None:
     """Add the environment's irradiance to `diffuse`. Its unoccluded value is exact; how much of it arrives is asked
     along one direction, chosen in proportion to what it would bring (`_sky_direction`). The same answer dims the sky's
     highlight (`_add_gloss_of_sky`)."""
@@ -230,7 +230,7 @@ def _gather_sky(block: Block, packet: Packet, world: World, sample: int, mask: i
     for lane in range(LANES):
         if block.on[lane] == 0 or block.matte[lane] == 0:
             continue
-        direction = _sky_direction(environment, row(block.ns, lane), key_of(block.key, lane), sample)
+        direction = _sky_direction(environment, row(block.ns, lane), key_of(block.key, lane))
         add_shadow_ray(packet, lane, row(block.point, lane), row(block.ng, lane), direction, math.inf)
     visible(packet, world, mask, seen)
     for lane in range(LANES):
@@ -244,7 +244,7 @@ def _gather_sky(block: Block, packet: Packet, world: World, sample: int, mask: i
 
 
 @inlined
-def _sky_direction(environment: EnvironmentTable, n: Vec, key: Key, sample: int) -> Vec:
+def _sky_direction(environment: EnvironmentTable, n: Vec, key: Key) -> Vec:
     """A direction with about the density of the sky's radiance times its cosine.
 
     Resampled importance sampling (Talbot et al. 2005) among two directions by the cosine and one by the radiance, each
@@ -254,17 +254,18 @@ def _sky_direction(environment: EnvironmentTable, n: Vec, key: Key, sample: int)
     """
     if environment.even:
         # The cosine alone is the density, and one direction keeps the sequence's strata, which a choice would break.
-        u1, u2 = unit_pair(key, sample, Purpose.SKY_COSINE.value)
+        u1, u2 = unit_pair(key, Purpose.SKY_COSINE.value)
         return _cosine_direction(n, u1, u2)
     direction, total = n, 0.0
-    pick = unit_pair(key, sample, Purpose.SKY_PICK.value)[0]
+    pick = unit_pair(key, Purpose.SKY_PICK.value)[0]
     for k in range(_COSINE_CANDIDATES + 1):
         if k < _COSINE_CANDIDATES:
-            u1, u2 = unit_pair(key, sample * _COSINE_CANDIDATES + k, Purpose.SKY_COSINE.value)
+            own = Key(key.x, key.y, key.branch, _COSINE_CANDIDATES * key.sample + k)
+            u1, u2 = unit_pair(own, Purpose.SKY_COSINE.value)
             candidate = _cosine_direction(n, u1, u2)
             radiance = direction_pdf(environment, candidate)
         else:
-            u1, u2 = unit_pair(key, sample, Purpose.SKY_RADIANCE.value)
+            u1, u2 = unit_pair(key, Purpose.SKY_RADIANCE.value)
             candidate, radiance = sample_direction(environment, u1, u2)
         cosine = dot(candidate, n)
         if cosine <= 0.0:
@@ -290,19 +291,19 @@ def _cosine_direction(n: Vec, u1: float, u2: float) -> Vec:
 
 
 @inlined
-def gather(block: Block, packet: Packet, world: World, sample: int, mask: int) -> None:
+def gather(block: Block, packet: Packet, world: World, mask: int) -> None:
     """What arrives at every hit: irradiance into `diffuse`, the lights' highlights into `specular`.
 
     `mask`: what casts shadows. The packet is overwritten.
     """
-    _gather_lights(block, packet, world, sample, mask)
-    _gather_sky(block, packet, world, sample, mask)
+    _gather_lights(block, packet, world, mask)
+    _gather_sky(block, packet, world, mask)
 
 
 @inlined
-def _shade_without_bounce(block: Block, packet: Packet, world: World, sample: int, mask: int) -> None:
+def _shade_without_bounce(block: Block, packet: Packet, world: World, mask: int) -> None:
     """Emission, lights and environment of every hit in the block."""
-    gather(block, packet, world, sample, mask)
+    gather(block, packet, world, mask)
     for lane in range(LANES):
         if block.on[lane] == 0:
             continue
@@ -332,12 +333,12 @@ def _reflects_the_scene(f0: Vec, roughness: float) -> bool:
 
 
 @inlined
-def shade(block: Block, second: Block, packet: Packet, world: World, sample: int, mask: int) -> None:
+def shade(block: Block, second: Block, packet: Packet, world: World, mask: int) -> None:
     """Radiance of every hit in `block` into `block.color`. `second` is another block, for what the mirrors show.
 
     `mask`: what reflections and shadows may meet. The packet is overwritten.
     """
-    _shade_without_bounce(block, packet, world, sample, mask)
+    _shade_without_bounce(block, packet, world, mask)
     clear(packet)
     some = False
     for lane in range(LANES):
@@ -348,24 +349,24 @@ def shade(block: Block, second: Block, packet: Packet, world: World, sample: int
         f0, roughness = row(block.f0, lane), block.roughness[lane]
         if _reflects_the_scene(f0, roughness):
             some = True
-            _add_mirror_ray(block, lane, packet, sample, mask)
+            _add_mirror_ray(block, lane, packet, mask)
         else:
             _add_gloss_of_sky(block, lane, world, f0, roughness, 1.0)
         if block.coat[lane] > 0.0:
             _add_gloss_of_sky(block, lane, world, (_COAT_F0, _COAT_F0, _COAT_F0), block.coat_roughness[lane],
                               block.coat[lane])  # fmt: skip
     if some:
-        _add_mirrored(block, second, packet, world, sample, mask)
+        _add_mirrored(block, second, packet, world, mask)
 
 
 @inlined
-def _add_mirrored(block: Block, second: Block, packet: Packet, world: World, sample: int, mask: int) -> None:
+def _add_mirrored(block: Block, second: Block, packet: Packet, world: World, mask: int) -> None:
     """Trace the mirror rays in the packet, and add what they see. It is lit, but mirrors nothing itself any more."""
     for lane in range(LANES):
         set_key(second.key, lane, branched(key_of(block.key, lane), MIRRORED))
     intersect_world(packet, world, block.bounce_end, SCATTERED)
     load_hits(second, packet, world, 0.0)
-    _shade_without_bounce(second, packet, world, sample, mask)
+    _shade_without_bounce(second, packet, world, mask)
     for lane in range(LANES):
         if block.bounced[lane] == 0:
             continue
@@ -382,13 +383,13 @@ def _add_mirrored(block: Block, second: Block, packet: Packet, world: World, sam
 
 
 @inlined
-def _add_mirror_ray(block: Block, lane: int, packet: Packet, sample: int, mask: int) -> None:
+def _add_mirror_ray(block: Block, lane: int, packet: Packet, mask: int) -> None:
     """Put the mirror ray of a hit into the packet: about one microfacet of its lobe where it is not quite smooth."""
     n, wo = row(block.ns, lane), row(block.wo, lane)
     alpha = block.roughness[lane] ** 2
     h = n
     if alpha > MIRROR_ALPHA:
-        u1, u2 = unit_pair(key_of(block.key, lane), sample, Purpose.MIRROR.value)
+        u1, u2 = unit_pair(key_of(block.key, lane), Purpose.MIRROR.value)
         h = sample_half_vector(n, wo, alpha, u1, u2)
     r = normalize(sub(scale(h, 2.0 * dot(h, wo)), wo))
     ng = row(block.ng, lane)
