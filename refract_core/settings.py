@@ -15,7 +15,7 @@ QUALITIES: dict[str, dict[str, Any]] = {
     "draft": {"samples": 1, "cut": 0.05},
     "good": {"samples": 4, "cut": 0.02},
     "best": {"samples": 16, "cut": 0.005, "tiers": ("probe", "ray", "sky")},
-    "reference": {"samples": 256, "cut": 0.0005, "tiers": ("ray", "sky"), "max_layers": 32},
+    "reference": {"samples": 256, "tolerance": 0.0, "cut": 0.0005, "tiers": ("ray", "sky"), "max_layers": 32},
 }
 """What each level of quality stands for; each setting may also be chosen by its own name. The last two leave out what
 the picture lends its glass, and the last one also what probes do."""
@@ -52,7 +52,10 @@ class RenderSettings:
     image_height: int = 0
     """[pixels]; 0 follows the camera's aspect."""
     samples: int = 4
-    """Samples per pixel, 1 .. 4096."""
+    """Samples per pixel, 1 .. 4096; 1 stands in its middle."""
+    tolerance: float = 0.03
+    """Where the corners of a pixel differ by no more, as the eye sees it, they are the pixel, 0 .. 1; others take all
+    samples. 0: every pixel does."""
     tiers: tuple[str, ...] = ("screen", "probe", "ray", "sky")
     """Order in which refraction and reflection look for their colour."""
     screen: str = "traced"
@@ -84,6 +87,7 @@ class RenderSettings:
         _in_range("samples", self.samples, 1, 4096)
         _in_range("max_layers", self.max_layers, 1, 32)
         _in_range("cut", self.cut, 0.0, 1.0)
+        _in_range("tolerance", self.tolerance, 0.0, 1.0)
         _in_range("jobs", self.jobs, 0, 4096)
         _in_range("tile_size", self.tile_size, 1, 65536)
         _in_range("exposure", self.exposure, -64.0, 64.0)

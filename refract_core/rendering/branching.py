@@ -8,36 +8,52 @@ from typing import Any
 import numpy as np
 
 from ..kernels.lanes import by_address, scratch
+from ..kernels.sampling import pixel_offsets
 from ..models import BY_TOKEN
 from ..scene import Camera, Scene
 from ..settings import SCREEN_METHODS, TIERS, RenderSettings
+from ..transport.corners import CornerScratch, Refining, corner_tile
 from ..transport.crossing import Rules
 from ..transport.eye import view_ray
 from ..transport.pixels import tree_tile
 from ..transport.tiers import Asking
 from ..transport.tree import TreeScratch
-from ..view.camera import Tile, View
-from ..view.gbuffer import OpaqueLayer, ViewScratch, opaque_tile
+from ..view.camera import Tile, View, corners_of, view_of
+from ..view.gbuffer import OpaqueLayer, ViewScratch, new_hits, opaque_tile
 from ..view.planes import Planes
 from ..view.pyramid import Screen, blur_level, fill_depth_levels, new_blur_scratch, new_screen_buffers
 from .integrator import Pass
 from .session import Session, is_rough
+from .work import tiles_of
+
+
+def by_corners(settings: RenderSettings) -> bool:
+    """Pixels are made from their corners."""
+    return settings.samples > 1 and settings.tolerance > 0.0 and settings.screen != "proxy"
 
 
 class Tree:
-    """An `Integrator`. Holds the buffers that every sample draws into anew; `planes` take the sums."""
+    """An `Integrator`. Holds the buffers that pictures are drawn into; `planes` take the sums of all samples.
+
+    Pixels are made from their corners, and samples drawn where these differ (`transport.corners`); or every sample is a
+    picture of its own, with an opaque picture to ask: where there is one sample alone, where no difference is passed,
+    and for HDRP's proxies, which tell a pixel by its place.
+    """
 
     def __init__(
         self, session: Session, scene: Scene, camera: Camera, settings: RenderSettings, tiles: list[Tile],
         planes: Planes,
     ) -> None:  # fmt: skip
         height, width = planes.mask.shape
-        self.session, self.tiles, self.planes = session, tiles, planes
+        self.session, self.camera, self.settings, self.tiles, self.planes = session, camera, settings, tiles, planes
         self.order = np.array([TIERS.index(t) for t in settings.tiers], np.int32)
         self.method = SCREEN_METHODS.index(settings.screen)
         model = int(BY_TOKEN[settings.model]) if settings.model else -1
-        self.rules = Rules(model, settings.max_layers, settings.cut, settings.screen != "proxy")
-        self.view_ray = view_ray(scene, camera, settings.model)
+        self.rules = by_address(Rules(model, settings.max_layers, settings.cut, settings.screen != "proxy"))
+        self.view_ray = by_address(view_ray(scene, camera, settings.model))
+        self.by_corners = by_corners(settings)
+        self.size = (width, height)
+        width, height = (width + 1, height + 1) if self.by_corners else (width, height)
         self.screen = new_screen_buffers(width, height, is_rough(scene))
         self.blurring = by_address(new_blur_scratch(self.screen.color_level))
         # The opaque layer is level 0 of the screen's pyramids.
@@ -48,11 +64,52 @@ class Tree:
             self.screen.irradiance,
             self.screen.gloss,
             np.zeros((height, width), np.uint8),
+            new_hits(width, height) if self.by_corners else new_hits(0, 0),
         )
 
-    def passes(self, view: View, sample: int) -> Iterator[Pass]:
-        world, camera = self.session.world, by_address(view)
+    def passes(self) -> Iterator[Pass]:
+        if self.by_corners:
+            yield from self._corner_passes()
+            return
+        samples = self.settings.samples
+        for sample, offset in enumerate(pixel_offsets(samples)):
+            yield from self._sample_passes(view_of(self.camera, *self.size, offset, samples), sample, 1.0 / samples)
+
+    def _corner_passes(self) -> Iterator[Pass]:
+        settings, (width, height) = self.settings, self.size
+        view = view_of(self.camera, width, height, samples=settings.samples)
+        corners = corners_of(view_of(self.camera, width, height))
+        tiles = tiles_of(width + 1, height + 1, settings.tile_size)
+        yield from self._opaque_passes(corners, 0, tiles, 0.2)
+        exposure = self.camera.exposure_scale * 2.0**settings.exposure
+        refining = by_address(Refining(settings.tolerance, exposure, np.array(pixel_offsets(settings.samples))))
+        world, asking, samples_view = self.session.world, by_address(self._asking(corners)), by_address(view)
         opaque, target = by_address(self.opaque), by_address(self.planes)
+
+        def draw(tile: Tile) -> int:
+            own, tree = scratch(CornerScratch), scratch(TreeScratch)
+            return int(
+                corner_tile(
+                    world, asking, self.rules, self.view_ray, refining, tree, own, tile, samples_view, opaque, target
+                )
+            )
+
+        yield Pass(draw, self.tiles, 0.8)
+
+    def _sample_passes(self, view: View, sample: int, share: float) -> Iterator[Pass]:
+        yield from self._opaque_passes(view, sample, self.tiles, 0.3 * share)
+        world, asking = self.session.world, by_address(self._asking(view))
+        opaque, target = by_address(self.opaque), by_address(self.planes)
+
+        def grow(tile: Tile) -> int:
+            tree = scratch(TreeScratch)
+            return int(tree_tile(world, asking, self.rules, self.view_ray, tree, tile, sample, opaque, target))
+
+        yield Pass(grow, self.tiles, 0.7 * share)
+
+    def _opaque_passes(self, view: View, sample: int, tiles: list[Tile], share: float) -> Iterator[Pass]:
+        """Draw the picture without glass, and what the screen tier reads of it."""
+        world, camera, opaque = self.session.world, by_address(view), by_address(self.opaque)
         glassy: list[Tile] = []
 
         def look(tile: Tile) -> int:
@@ -61,20 +118,15 @@ class Tree:
                 glassy.append(tile)
             return int(rays)
 
-        yield Pass(look, self.tiles)
+        yield Pass(look, tiles, share)
         if TIERS.index("screen") in self.order and glassy:
-            yield Pass(_without_rays, self._levels())
-        session = self.session
-        traces = TIERS.index("ray") in self.order
-        asking = by_address(
-            Asking(self.order, self.method, traces, Screen(view, *self.screen), session.probes, session.thing_probe)
-        )
-        rules, ray = by_address(self.rules), by_address(self.view_ray)
+            yield Pass(_without_rays, self._levels(), 0.0)
 
-        def grow(tile: Tile) -> int:
-            return int(tree_tile(world, asking, rules, ray, scratch(TreeScratch), tile, sample, opaque, target))
-
-        yield Pass(grow, self.tiles)
+    def _asking(self, view: View) -> Asking:
+        """Whom leaves ask, where `view` has drawn the opaque picture."""
+        session, traces = self.session, TIERS.index("ray") in self.order
+        screen = Screen(view, *self.screen)
+        return Asking(self.order, self.method, traces, screen, session.probes, session.thing_probe)
 
     def _levels(self) -> list[Callable[[], Any]]:
         """What makes the pyramids above the opaque picture, as far as somebody will read them."""

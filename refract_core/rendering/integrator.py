@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, Protocol
 
-from ..view.camera import View
-
 
 class Pass(NamedTuple):
     """One pass over the picture. Its items (tiles, as a rule) may be drawn in any order and side by side."""
@@ -14,16 +12,18 @@ class Pass(NamedTuple):
     draw: Callable[[Any], int]
     """draws one item, and returns the rays it traced"""
     items: Sequence[Any]
+    share: float
+    """of the whole work, about"""
 
 
 class Integrator(Protocol):
     """Finds the light of every pixel, and adds it to the planes it was made with.
 
-    What it is made with is its own affair (`branching.Tree` shows it); a frame asks it for one sample after the other.
+    What it is made with is its own affair (`branching.Tree` shows it).
     """
 
-    def passes(self, view: View, sample: int) -> Iterator[Pass]:
-        """The passes that draw one sample of every pixel as `view` sees it.
+    def passes(self) -> Iterator[Pass]:
+        """The passes that draw the picture.
 
         Each is finished on all its items before the next is asked for, so a pass may read what the ones before it left
         anywhere in the picture, and which passes there are may depend on that.

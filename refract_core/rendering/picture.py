@@ -6,6 +6,7 @@ stage -> Scene -> tables and BVH -> probes -> per sample: the integrator's passe
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import replace
 
@@ -24,7 +25,7 @@ from ..transport.pixels import tree_tile
 from ..version import __version__
 from ..view.camera import image_size, view_of
 from ..view.planes import by_name, finish_of, finish_tile, new_planes
-from .branching import Tree
+from .branching import Tree, by_corners
 from .session import Session, choose_camera, prepare
 from .work import Cancel, Progress, Work, tiles_of, working
 
@@ -105,15 +106,21 @@ def _draw(
     """All samples, averaged into planes. Returns the planes by AOV name, and rays traced."""
     tiles = tiles_of(*size, settings.tile_size)
     planes = new_planes(*size)
-    integrator = Tree(session, scene, camera, settings, tiles, planes)
-    rays = 0
-    offsets = pixel_offsets(settings.samples)
-    for sample in range(settings.samples):
-        work.progress(0.2 + 0.8 * sample / settings.samples, "image")
-        view = view_of(camera, *size, offsets[sample], settings.samples)
-        for step in integrator.passes(view, sample):
-            rays += sum(work.run(step.draw, step.items))
+    rays, done = 0, 0.2
+    for step in Tree(session, scene, camera, settings, tiles, planes).passes():
+        share = 0.8 * step.share
+        rays += sum(work.run(step.draw, step.items, _told(work, done, share)))
+        done += share
     finish = by_address(finish_of(scene, settings.samples, camera.exposure_scale * 2.0**settings.exposure))
-    first, target = by_address(view_of(camera, *size, offsets[0])), by_address(planes)
+    first, target = by_address(view_of(camera, *size, _first_offset(settings))), by_address(planes)
     work.run(lambda tile: finish_tile(target, first, finish, tile), tiles)
     return by_name(planes), rays
+
+
+def _told(work: Work, done: float, share: float) -> Callable[[float], None]:
+    return lambda part: work.progress(done + share * part, "image")
+
+
+def _first_offset(settings: RenderSettings) -> tuple[float, float]:
+    """Where in their pixels the places stand that the picture's data are of."""
+    return (0.0, 0.0) if by_corners(settings) else pixel_offsets(settings.samples)[0]

@@ -84,6 +84,15 @@ def view_of(
     return View(axes, window, size, clipping, camera.orthographic, spread)
 
 
+def corners_of(view: View) -> View:
+    """The view whose pixels have their middles in the corners of the pixels of `view`: one more along each side."""
+    left, right, bottom, top = view.window
+    width, height = view.size
+    dx, dy = 0.5 * (right - left) / width, 0.5 * (top - bottom) / height
+    window = np.array([left - dx, right + dx, bottom - dy, top + dy])
+    return view._replace(window=window, size=view.size + 1)
+
+
 @inlined
 def pixel_ray(view: View, px: float, py: float) -> tuple[Vec, Vec, float]:
     """Ray through a pixel coordinate: origin [m], unit direction, cosine to the camera axis."""

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from ..kernels.arrays import F32_2D, F32_3D, U8_2D
+import numpy as np
+
+from ..kernels.arrays import F32_2D, F32_3D, I32_2D, U8_2D
 from ..kernels.compile import inlined, kernel
 from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Flags, Scalars
 from ..kernels.sampling import Key, set_key
@@ -39,6 +41,24 @@ class ViewScratch(NamedTuple):
     """lanes of the block that are in the picture, while those behind glass are traced again"""
 
 
+class PictureHits(NamedTuple):
+    """What each pixel shows, as `surface.Hit`: shape (H, W) each, or (0, 0) where nobody asks. Its distance is in the
+    picture's depth."""
+
+    part: I32_2D
+    primitive: I32_2D
+    instance: I32_2D
+    material: I32_2D
+    u: F32_2D
+    v: F32_2D
+
+
+def new_hits(width: int, height: int) -> PictureHits:
+    """Room for the hits of a picture."""
+    words, numbers = np.zeros((4, height, width), np.int32), np.zeros((2, height, width), np.float32)
+    return PictureHits(words[0], words[1], words[2], words[3], numbers[0], numbers[1])
+
+
 class OpaqueLayer(NamedTuple):
     """What the camera would see without refractive objects. One sample per pixel."""
 
@@ -55,6 +75,7 @@ class OpaqueLayer(NamedTuple):
     """shape (H, W, 3): radiance that is neither emitted nor diffuse: highlights and what is mirrored"""
     glass: U8_2D
     """shape (H, W): 1 where the camera's ray meets glass first"""
+    hits: PictureHits
 
 
 @inlined
@@ -106,6 +127,8 @@ def opaque_tile(
                     glass += 1
             if behind:
                 _trace_behind_glass(scratch, world, view, x0, y0)
+            if layer.hits.part.shape[0] > 0:
+                _keep_hits(layer.hits, packet, world, x0, y0, width, height)
             load_hits(block, packet, world, view.spread)
             shade(block, scratch.second, packet, world, OPAQUE)
             _write_opaque(layer, block, world, view, x0, y0)
@@ -126,6 +149,18 @@ def _trace_behind_glass(scratch: ViewScratch, world: World, view: View, x0: int,
     intersect_world(packet, world, scratch.far, COHERENT)
     for lane in range(LANES):
         packet.valid[lane] = scratch.asked[lane]
+
+
+@inlined
+def _keep_hits(hits: PictureHits, packet: Packet, world: World, x0: int, y0: int, width: int, height: int) -> None:
+    for lane in range(LANES):
+        x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
+        if x >= width or y >= height or not has_hit(packet, lane):
+            continue
+        hit = hit_in(packet, lane, world.geometry)
+        hits.part[y, x], hits.primitive[y, x], hits.instance[y, x] = hit.part, hit.primitive, hit.instance
+        hits.material[y, x] = hit.material
+        hits.u[y, x], hits.v[y, x] = hit.u, hit.v
 
 
 @inlined

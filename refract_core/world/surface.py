@@ -108,7 +108,8 @@ def kept_hit(hits: HitLanes, lane: int) -> Hit:
 
 
 @inlined
-def _corners(geometry: Geometry, part: int, primitive: int) -> tuple[Vec, Vec, Vec]:
+def corners_of(geometry: Geometry, part: int, primitive: int) -> tuple[Vec, Vec, Vec]:
+    """The three corners of a triangle [m]."""
     t = geometry.first[part] + primitive
     a = row(geometry.points, geometry.triangles[t, 0])
     b = row(geometry.points, geometry.triangles[t, 1])
@@ -130,7 +131,7 @@ def interaction(geometry: Geometry, hit: Hit, ray: Ray, footprint: float) -> Int
         point = along(centre, ng, np.float64(geometry.sphere[part, 3]))
         ns = ng
     else:
-        a, b, c = _corners(geometry, part, hit.primitive)
+        a, b, c = corners_of(geometry, part, hit.primitive)
         ab, ac = sub(b, a), sub(c, a)
         ng = normalize(cross(ab, ac))
         point = (
@@ -208,7 +209,7 @@ def _uv_density(geometry: Geometry, hit: Hit, slot: int) -> float:
     stride = geometry.primvar_stride[hit.part, slot]
     if stride == 0 or geometry.sphere[hit.part, 3] > 0.0:
         return 0.0
-    a, b, c = _corners(geometry, hit.part, hit.primitive)
+    a, b, c = corners_of(geometry, hit.part, hit.primitive)
     area = length(cross(sub(b, a), sub(c, a)))
     k = geometry.primvar_first[hit.part, slot] + hit.primitive * stride
     size = geometry.primvar_size[hit.part, slot]
@@ -315,7 +316,7 @@ def normal_input(world: World, at: Interaction) -> Vec:
     stride = geometry.primvar_stride[hit.part, slot]
     if geometry.primvar_first[hit.part, slot] < 0 or stride == 0:
         return at.ns
-    a, b, c = _corners(geometry, hit.part, hit.primitive)
+    a, b, c = corners_of(geometry, hit.part, hit.primitive)
     k = geometry.primvar_first[hit.part, slot] + hit.primitive * stride
     size = geometry.primvar_size[hit.part, slot]
     p = geometry.primvars

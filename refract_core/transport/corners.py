@@ -1,0 +1,463 @@
+"""Pixels from their corners: a picture with few rays, and none too many where it is smooth
+(docs/decisions/corners.md).
+
+A corner is shared by four pixels. Its view ray is followed like any other, and its leaves are kept. A pixel compares
+those of its four corners: a leaf that all have is seen all over the pixel; its weight and light are their mean, and its
+texture is looked at all over the quadrilateral between them. Where corners differ by more than the eye would pass, the
+pixel is an *edge*, and is drawn with samples of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ..kernels.arrays import F64_2D, I32_1D, I64_1D
+from ..kernels.compile import flag, inlined, kernel
+from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, put
+from ..kernels.sampling import Key
+from ..kernels.vec import Vec, add, dot, length, lerp, mul, normalize, row, scale, sub
+from ..view.camera import Tile, View, pixel_ray
+from ..view.gbuffer import OpaqueLayer
+from ..view.planes import Planes
+from ..world.shading import load_surface
+from ..world.surface import Hit, Ray, corners_of, interaction
+from ..world.tables import World
+from .answers import MOST_ANSWERS, Answers, add_direct, add_sky, body_light, hit_of, keep_answers
+from .crossing import Rules
+from .pixels import add_glass, add_light, keep_glass, keep_place
+from .rays import MIRRORED_SIDE, THROUGH_SIDE, Rays
+from .tiers import Asking
+from .tree import CELL, SLOTS, TreeScratch, clear_slot, follow, start
+
+PATCH = 32
+"""Pixels along the side of a patch, which is done at once."""
+_ROW = PATCH + 1
+"""Corners along it."""
+_GLASS_ONLY, _ALL = flag(False), flag(True)
+_ALIKE = 0.9
+"""Cosine of the normals of a surface above which neighbours may see the same side of it."""
+_SAME_WAY = 0.98
+"""Cosine of directions above which their rays have come the same way."""
+_SMOOTH = 5.0
+"""Times the tolerance that light may change along a surface that all corners see: there a mean is exact to the second
+order."""
+_PAINTED = 0.2
+"""Times the tolerance, below which a texture is not looked at between the corners."""
+_MOST_TAPS = 8
+"""Along each side of a quadrilateral."""
+
+
+class Refining(NamedTuple):
+    """Which pixels are drawn with samples of their own, and with which."""
+
+    tolerance: float
+    """largest difference between corners that is passed, of the square root of light, clipped at 1"""
+    exposure: float
+    """of the picture: what light is multiplied with before it is looked at"""
+    offsets: F64_2D
+    """shape (S, 2): of the samples, from the pixel's middle [pixels]"""
+
+
+class CornerScratch(NamedTuple):
+    """What one thread needs besides a tree's."""
+
+    edges: I32_1D
+    """pixels of the patch that are edges"""
+    found: I64_1D
+    """shape (4,): the rows of four answers that match"""
+    used: I64_1D
+    """shape (4,): bits of the answers that have found their like, corner by corner"""
+    filtered: F64_2D
+    """shape (2, 3): emission and albedo over a pixel"""
+    alone: F64_2D
+    """shape (4, 3): light that each corner alone has"""
+    shared: F64_2D
+    """shape (4, 3): light that all have, without what textures do to it"""
+
+    @staticmethod
+    def fresh() -> CornerScratch:
+        """All of it at zero."""
+        return CornerScratch(
+            np.zeros(PATCH * PATCH, np.int32), np.zeros(4, np.int64), np.zeros(4, np.int64),
+            np.zeros((2, 3)), np.zeros((4, 3)), np.zeros((4, 3)),
+        )  # fmt: skip
+
+
+# --- a tile -------------------------------------------------------------------------------------------------------
+
+
+@kernel
+def corner_tile(
+    world: World,
+    asking: Asking,
+    rules: Rules,
+    view_ray: Rays,
+    refining: Refining,
+    scratch: TreeScratch,
+    own: CornerScratch,
+    tile: Tile,
+    view: View,
+    opaque: OpaqueLayer,
+    planes: Planes,
+) -> int:
+    """Draw a tile: `planes` get as much as they would from all samples.
+
+    Args:
+        asking: its screen shows the corners.
+        view: of the samples at edges.
+        opaque: the corners' opaque picture, with hits.
+
+    Returns:
+        Rays traced.
+    """
+    scratch.packet.tally[0] = scratch.work.packet.tally[0] = 0
+    for y0 in range(tile[1], min(tile[3], view.size[1]), PATCH):
+        for x0 in range(tile[0], min(tile[2], view.size[0]), PATCH):
+            width, height = min(PATCH, view.size[0] - x0), min(PATCH, view.size[1] - y0)
+            keep_answers(scratch.answers, True)
+            _draw_corners(scratch, world, asking, rules, view_ray, opaque, x0, y0, width + 1, height + 1)
+            keep_answers(scratch.answers, False)
+            edges = 0
+            for j in range(height):
+                for i in range(width):
+                    if not _draw_pixel(scratch, own, world, refining, planes, x0 + i, y0 + j, j * _ROW + i):
+                        own.edges[edges] = j * PATCH + i
+                        edges += 1
+            _draw_edges(scratch, own, world, asking, rules, view_ray, refining, view, planes, x0, y0, edges)
+    return scratch.packet.tally[0] + scratch.work.packet.tally[0]
+
+
+@inlined
+def _draw_corners(
+    scratch: TreeScratch, world: World, asking: Asking, rules: Rules, view_ray: Rays, opaque: OpaqueLayer,
+    x0: int, y0: int, columns: int, rows: int,
+) -> None:  # fmt: skip
+    """Fill the slots of a patch, a row of 33 after the other: blocks of 4x2 corners with glass, cell by cell."""
+    view = asking.screen.camera
+    submerged = view_ray.media.depth[0] > 0
+    count = 0
+    for by in range(0, rows, BLOCK_HEIGHT):
+        for bx in range(0, columns, BLOCK_WIDTH):
+            for lane in range(LANES):
+                i, j = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
+                if i >= columns or j >= rows:
+                    continue
+                x, y, slot = x0 + i, y0 + j, j * _ROW + i
+                scratch.answers.filled[slot] = 0
+                if opaque.glass[y, x] == 0 and not submerged:
+                    _keep_opaque(scratch, world, view, opaque, x, y, slot)
+                else:
+                    count = start(scratch, view, view_ray, count, slot, x + 0.5, y + 0.5, Key(x, y, 0, 0))
+            if count > CELL - LANES:
+                follow(scratch, world, asking, rules, view, count, _GLASS_ONLY)
+                count = 0
+    if count > 0:
+        follow(scratch, world, asking, rules, view, count, _GLASS_ONLY)
+    for j in range(rows):
+        for i in range(columns):
+            slot = j * _ROW + i
+            if scratch.answers.filled[slot] == 0 and scratch.cell.glass[slot] == 0:  # it passed what glass it met
+                _keep_opaque(scratch, world, view, opaque, x0 + i, y0 + j, slot)
+
+
+@inlined
+def _keep_opaque(
+    scratch: TreeScratch, world: World, view: View, opaque: OpaqueLayer, x: int, y: int, slot: int
+) -> None:
+    """Take a corner from the opaque picture."""
+    cell = scratch.cell
+    clear_slot(cell, slot)
+    origin, direction, cosine = pixel_ray(view, x + 0.5, y + 0.5)
+    light = row(opaque.color[y], x)
+    put(cell.color, slot, light)
+    cell.missing[slot] = 1.0 - opaque.color[y, x, 3]
+    cell.z_depth[slot] = opaque.depth[y, x]
+    put(cell.normal, slot, row(opaque.normal[y], x))
+    if opaque.depth[y, x] == math.inf:
+        add_sky(scratch.answers, slot, direction, light)
+        return
+    t = opaque.depth[y, x] / cosine
+    hits = opaque.hits
+    hit = Hit(
+        hits.part[y, x], hits.primitive[y, x], hits.instance[y, x], hits.material[y, x],
+        np.float64(hits.u[y, x]), np.float64(hits.v[y, x]), t,
+    )  # fmt: skip
+    at = interaction(world.geometry, hit, Ray(origin, direction), view.spread * t)
+    block = scratch.block_of_one
+    load_surface(block, 0, at, world, scale(direction, -1.0))
+    irradiance, gloss = row(opaque.irradiance[y], x), row(opaque.gloss[y], x)
+    add_direct(scratch.answers, slot, at, direction, block, 0, irradiance, gloss)
+
+
+# --- a pixel ------------------------------------------------------------------------------------------------------
+
+
+@inlined
+def _draw_pixel(
+    scratch: TreeScratch, own: CornerScratch, world: World, refining: Refining, planes: Planes,
+    x: int, y: int, slot: int,
+) -> bool:  # fmt: skip
+    """Make a pixel of its corners. False if it is an edge, and nothing has been done."""
+    answers = scratch.answers
+    for k in range(4):
+        if answers.filled[_corner(slot, k)] > MOST_ANSWERS:
+            return False
+        own.used[k] = 0
+        for c in range(3):
+            own.alone[k, c] = own.shared[k, c] = 0.0
+    color, through, mirrored = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    seen = (0.0, 0.0, 0.0)
+    for k in range(4):
+        seen = add(seen, scale(row(scratch.cell.color, _corner(slot, k)), 0.25))
+    for n in range(answers.filled[slot]):
+        r = slot * MOST_ANSWERS + n
+        if not _match(answers, own, slot, r):
+            continue
+        light = _light_of_four(scratch, own, world, refining, seen)
+        color = add(color, light)
+        if answers.side[r] == THROUGH_SIDE:
+            through = add(through, light)
+        elif answers.side[r] == MIRRORED_SIDE:
+            mirrored = add(mirrored, light)
+    for k in range(4):
+        base = _corner(slot, k) * MOST_ANSWERS
+        for n in range(answers.filled[_corner(slot, k)]):
+            if (own.used[k] >> n) & 1 != 0:
+                continue
+            r = base + n
+            there = body_light(answers, r, row(answers.emissive, r), row(answers.albedo, r))
+            light = mul(row(answers.weight, r), there)
+            put(own.alone, k, add(row(own.alone, k), light))
+            color = add(color, scale(light, 0.25))
+            if answers.side[r] == THROUGH_SIDE:
+                through = add(through, scale(light, 0.25))
+            elif answers.side[r] == MIRRORED_SIDE:
+                mirrored = add(mirrored, scale(light, 0.25))
+    if refining.offsets.shape[0] > 1 and _differ(scratch, own, refining, slot):
+        return False
+    _write_pixel(scratch, planes, refining.offsets.shape[0], x, y, slot, color, through, mirrored)
+    return True
+
+
+@inlined
+def _corner(slot: int, k: int) -> int:
+    """The slot of corner `k` of the pixel whose first corner is `slot`: along x first."""
+    return slot + k % 2 + k // 2 * _ROW
+
+
+@inlined
+def _match(answers: Answers, own: CornerScratch, slot: int, r: int) -> bool:
+    """Whether the other corners have an answer like row `r` of the first; if so, all four are noted, and used up."""
+    own.found[0] = r
+    for k in range(1, 4):
+        base = _corner(slot, k) * MOST_ANSWERS
+        found = -1
+        for n in range(answers.filled[_corner(slot, k)]):
+            if found < 0 and (own.used[k] >> n) & 1 == 0 and _alike(answers, r, base + n):
+                found = base + n
+        if found < 0:
+            return False
+        own.found[k] = found
+    for k in range(4):
+        own.used[k] |= 1 << (own.found[k] - _corner(slot, k) * MOST_ANSWERS)
+    return True
+
+
+@inlined
+def _alike(answers: Answers, r: int, s: int) -> bool:
+    """Two corners see the same surface by the same way."""
+    if answers.way[r] != answers.way[s] or answers.side[r] != answers.side[s]:
+        return False
+    if (answers.share[r] > 0.0) != (answers.share[s] > 0.0):
+        return False
+    dr, ds = row(answers.direction, r), row(answers.direction, s)
+    if dot(dr, ds) < _SAME_WAY * dot(dr, dr):  # those of a glow are 0
+        return False
+    nr = row(answers.normal, r)
+    return dot(nr, row(answers.normal, s)) >= _ALIKE * dot(nr, nr)
+
+
+@inlined
+def _light_of_four(
+    scratch: TreeScratch, own: CornerScratch, world: World, refining: Refining, seen: Vec
+) -> Vec:
+    """Light that a pixel gets from four answers that match; and what each corner gets of it goes to `own.shared`."""
+    answers, found = scratch.answers, own.found
+    weight, emissive, albedo = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    for k in range(4):
+        weight = add(weight, scale(row(answers.weight, found[k]), 0.25))
+        emissive = add(emissive, scale(row(answers.emissive, found[k]), 0.25))
+        albedo = add(albedo, scale(row(answers.albedo, found[k]), 0.25))
+    if answers.share[found[0]] > 0.0 and _is_painted(answers, found, world, weight, seen, refining):
+        _filter(scratch, own, world)
+        emissive, albedo = row(own.filtered, 0), row(own.filtered, 1)
+    light = (0.0, 0.0, 0.0)
+    for k in range(4):
+        r = found[k]
+        there = body_light(answers, r, emissive, albedo)
+        light = add(light, scale(there, 0.25))
+        put(own.shared, k, add(row(own.shared, k), mul(row(answers.weight, r), there)))
+    return mul(weight, light)
+
+
+@inlined
+def _is_painted(
+    answers: Answers, found: I64_1D, world: World, weight: Vec, seen: Vec, refining: Refining
+) -> bool:
+    """A texture changes the light of four answers by so much that it has to be looked at between them."""
+    hit = hit_of(answers, found[0])
+    if world.materials.driven[hit.material] == 0 or world.geometry.sphere[hit.part, 3] > 0.0:
+        return False
+    for c in range(3):
+        low, high = math.inf, -math.inf
+        for k in range(4):
+            r = found[k]
+            lit = answers.albedo[r, c] * answers.irradiance[r, c] / math.pi
+            light = weight[c] * answers.share[r] * (answers.emissive[r, c] + lit)
+            low, high = min(low, light), max(high, light)
+        more = _shown(seen[c] + high - low, refining.exposure) - _shown(seen[c], refining.exposure)
+        if more > _PAINTED * refining.tolerance:
+            return True
+    return False
+
+
+@inlined
+def _filter(scratch: TreeScratch, own: CornerScratch, world: World) -> None:
+    """Emission and albedo of a surface, over the quadrilateral between the points where four rays meet it."""
+    answers, found, block = scratch.answers, own.found, scratch.block_of_one
+    a, b = row(answers.point, found[0]), row(answers.point, found[1])
+    c, d = row(answers.point, found[2]), row(answers.point, found[3])
+    wide = 0.5 * (length(sub(b, a)) + length(sub(d, c)))
+    high = 0.5 * (length(sub(c, a)) + length(sub(d, b)))
+    step = max(0.5 * min(wide, high), max(wide, high) / _MOST_TAPS, 1e-9)
+    across, down = min(_MOST_TAPS, math.ceil(wide / step - 1e-6)), min(_MOST_TAPS, math.ceil(high / step - 1e-6))
+    across, down = max(across, 2), max(down, 2)
+    emissive, albedo = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    for j in range(down):
+        t = (j + 0.5) / down
+        for i in range(across):
+            s = (i + 0.5) / across
+            p = lerp(lerp(a, b, s), lerp(c, d, s), t)
+            near = found[(1 if s > 0.5 else 0) + (2 if t > 0.5 else 0)]
+            hit = _moved(world, hit_of(answers, near), sub(p, row(answers.point, near)))
+            wo = scale(row(answers.direction, near), -1.0)
+            at = interaction(world.geometry, hit, Ray(p, wo), _SHARPER * step)
+            load_surface(block, 0, at, world, wo)
+            emissive, albedo = add(emissive, row(block.emissive, 0)), add(albedo, row(block.albedo, 0))
+    put(own.filtered, 0, scale(emissive, 1.0 / (across * down)))
+    put(own.filtered, 1, scale(albedo, 1.0 / (across * down)))
+
+
+_SHARPER = 0.5
+"""Of the distance between taps, what each of them sees of the texture: what a mip level holds reaches twice as far."""
+
+
+@inlined
+def _moved(world: World, hit: Hit, off: Vec) -> Hit:
+    """The place beside a hit, in the plane of its triangle: so a texture goes on beyond the triangle's border."""
+    a, b, c = corners_of(world.geometry, hit.part, hit.primitive)
+    x, y = sub(b, a), sub(c, a)
+    xx, xy, yy = dot(x, x), dot(x, y), dot(y, y)
+    area = xx * yy - xy * xy
+    if area <= 0.0:
+        return hit
+    px, py = dot(off, x), dot(off, y)
+    u, v = hit.u + (yy * px - xy * py) / area, hit.v + (xx * py - xy * px) / area
+    return Hit(hit.part, hit.primitive, hit.instance, hit.material, u, v, hit.t)
+
+
+@inlined
+def _shown(light: float, exposure: float) -> float:
+    """About how bright it is to the eye."""
+    return math.sqrt(min(1.0, max(0.0, light * exposure)))
+
+
+@inlined
+def _differ(scratch: TreeScratch, own: CornerScratch, refining: Refining, slot: int) -> bool:
+    """The corners show something that their mean would not do justice."""
+    for c in range(3):
+        common = 0.25 * (own.shared[0, c] + own.shared[1, c] + own.shared[2, c] + own.shared[3, c])
+        low, high, least, most = math.inf, -math.inf, math.inf, -math.inf
+        for k in range(4):
+            alone = _shown(common + own.alone[k, c], refining.exposure)
+            low, high = min(low, alone), max(high, alone)
+            shared = _shown(own.shared[k, c], refining.exposure)
+            least, most = min(least, shared), max(most, shared)
+        if high - low > refining.tolerance or most - least > _SMOOTH * refining.tolerance:
+            return True
+    cell = scratch.cell
+    least_missing, most_missing = math.inf, -math.inf
+    for k in range(4):
+        missing = cell.missing[_corner(slot, k)]
+        least_missing, most_missing = min(least_missing, missing), max(most_missing, missing)
+    return most_missing - least_missing > refining.tolerance
+
+
+@inlined
+def _write_pixel(
+    scratch: TreeScratch, planes: Planes, samples: int, x: int, y: int, slot: int,
+    color: Vec, through: Vec, mirrored: Vec,
+) -> None:  # fmt: skip
+    """Write a pixel's light, and the mean of what else its corners know."""
+    cell = scratch.cell
+    z, normal, missing = 0.0, (0.0, 0.0, 0.0), 0.0
+    glass = -1
+    for k in range(4):
+        i = _corner(slot, k)
+        z += 0.25 * cell.z_depth[i]
+        normal = add(normal, row(cell.normal, i))
+        missing += 0.25 * cell.missing[i]
+        if cell.glass[i] != 0:
+            add_glass(planes, cell, i, x, y, 0.25 * samples)
+            glass = i if glass < 0 else glass
+    for c in range(3):
+        planes.beauty[y, x, c] = samples * color[c]
+        if glass >= 0:
+            planes.refraction[y, x, c] = samples * through[c]
+            planes.reflection[y, x, c] = samples * mirrored[c]
+    planes.beauty[y, x, 3] = samples * (1.0 - missing)
+    if glass >= 0:
+        keep_glass(planes, cell, glass, x, y)
+    if dot(normal, normal) > 0.0:
+        normal = normalize(normal)
+    planes.z_depth[y, x] = z
+    for c in range(3):
+        planes.normal[y, x, c] = normal[c]
+
+
+# --- edges --------------------------------------------------------------------------------------------------------
+
+
+@inlined
+def _draw_edges(
+    scratch: TreeScratch, own: CornerScratch, world: World, asking: Asking, rules: Rules, view_ray: Rays,
+    refining: Refining, view: View, planes: Planes, x0: int, y0: int, edges: int,
+) -> None:  # fmt: skip
+    """Draw the pixels of a patch that its corners do not tell, all samples of one after the other."""
+    samples = refining.offsets.shape[0]
+    total = edges * samples
+    for first in range(0, total, CELL):
+        taken = min(CELL, total - first)
+        for slot in range(taken):
+            pixel, sample = own.edges[(first + slot) // samples], (first + slot) % samples
+            x, y = x0 + pixel % PATCH, y0 + pixel // PATCH
+            px, py = x + 0.5 + refining.offsets[sample, 0], y + 0.5 + refining.offsets[sample, 1]
+            start(scratch, view, view_ray, slot, slot, px, py, Key(x, y, 0, sample))
+        follow(scratch, world, asking, rules, view, taken, _ALL)
+        cell = scratch.cell
+        for slot in range(taken):
+            x, y = cell.x[slot], cell.y[slot]
+            add_light(planes, cell, slot, x, y)
+            planes.confidence[y, x] = 1000.0
+            if cell.glass[slot] != 0:
+                add_glass(planes, cell, slot, x, y, 1.0)
+            if cell.sample[slot] == 0:
+                keep_place(planes, cell, slot, x, y)
+                if cell.glass[slot] != 0:
+                    keep_glass(planes, cell, slot, x, y)
+
+
+assert SLOTS == _ROW * _ROW
