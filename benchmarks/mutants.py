@@ -85,7 +85,7 @@ MUTANTS = (
     Mutant("no normal map on glass", "transport/crossing.py",
            "n = flip_towards(normal_input(world, at), ng)", "n = flip_towards(at.ns, ng)"),
     Mutant("a steep normal bends light back into the glass", "transport/crossing.py",
-           "if meeting.kind[lane] == LEFT:  # a steep", "if meeting.kind[lane] > LEFT:  # a steep"),
+           "if dot(out, ng) >= 0.0:  # a steep", "if dot(out, ng) >= 2.0:  # a steep"),
     Mutant("a steep normal mirrors into the surface", "transport/crossing.py",
            "if dot(r, ng) <= 0.0:", "if dot(r, ng) <= -2.0:"),
     Mutant("reflection without Fresnel", "transport/crossing.py",

@@ -284,12 +284,8 @@ def _bend(meeting: Meeting, lane: int, c: int, d: Vec, n1: float, n2: float) -> 
         meeting.length[lane, c] = length
         return fresnel_dielectric(abs(dot(n, d)), n1 / n2)
     passes, out = refract(d, n, n1 / n2)
-    if passes and dot(out, ng) >= 0.0:
-        if meeting.kind[lane] == LEFT:  # a steep shading normal must not keep it in by bending it
-            passes = False
-        else:
-            n = ng
-            passes, out = refract(d, n, n1 / n2)
+    if dot(out, ng) >= 0.0:  # a steep shading normal turns it back: by the true one it is totally reflected
+        passes = False
     put(meeting.through[lane], c, out)
     return fresnel_dielectric(abs(dot(n, d)), n1 / n2) if passes else 1.0
 
