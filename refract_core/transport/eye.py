@@ -7,7 +7,8 @@ import math
 import numpy as np
 
 from ..models import BY_TOKEN, Behind
-from ..scene import F32, U32, Camera, Material, Param, Scene
+from ..scene import Camera, Material, Param, Scene
+from ..world.solid import winding
 from .rays import ALL_CHANNELS, MOST_MEDIA, VIEW, Rays, add_medium, new_rays
 
 
@@ -31,7 +32,8 @@ def view_ray(scene: Scene, camera: Camera, model: str) -> Rays:
     for thing, mesh in enumerate(scene.meshes):
         if mesh.closed and len(mesh.triangles) and _is_traced(material := scene.materials[mesh.materials[0]], model):
             low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
-            if ((low < eye) & (eye < high)).all() and winding(mesh.points, mesh.triangles, eye) > 0.5:
+            near = ((low < eye) & (eye < high)).all()
+            if near and winding(eye, mesh.points.astype(np.float64), mesh.triangles) > 0.5:
                 around.append((float(np.prod(high - low)), thing, material))
     for k, ball in enumerate(scene.spheres):
         if _is_traced(material := scene.materials[ball.material], model) and math.dist(ball.centre, eye) < ball.radius:
@@ -46,20 +48,3 @@ def view_ray(scene: Scene, camera: Camera, model: str) -> Rays:
 
 def _is_traced(material: Material, model: str) -> bool:
     return material.refractive and (BY_TOKEN[model] if model else material.model).behind is Behind.MESH
-
-
-def winding(points: F32, triangles: U32, p: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> float:
-    """How often a closed mesh winds around a point: 1 inside, 0 outside, -1 inside of one that is inside out.
-
-    The solid angles of its triangles, summed (Van Oosterom and Strackee, IEEE Trans. Biomed. Eng. 30(2), 1983).
-
-    Args:
-        points: shape (V, 3) [m].
-        triangles: shape (T, 3), counter-clockwise from outside.
-        p: shape (3,) [m].
-    """
-    a, b, c = (points[triangles[:, k]].astype(np.float64) - p for k in range(3))
-    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
-    volume = np.einsum("ij,ij->i", a, np.cross(b, c))
-    ab, bc, ca = (np.einsum("ij,ij->i", u, v) for u, v in ((a, b), (b, c), (c, a)))
-    return float(np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb).sum() / (2.0 * math.pi))
