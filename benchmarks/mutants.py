@@ -67,6 +67,8 @@ MUTANTS = (
            "key=lambda body: -body[0]", "key=lambda body: body[0]"),
     Mutant("the eye is in no body", "transport/eye.py",
            "mesh.triangles) > 0.5", "mesh.triangles) > 1.5"),
+    Mutant("the eye is in what a body's first face is of", "transport/eye.py",
+           "mesh.materials[of_glass.argmax()]", "mesh.materials[0]"),
     # --- media
     Mutant("of equal priority the body entered first fills", "transport/rays.py",
            "media.priority[i, k] >= media.priority[i, best]", "media.priority[i, k] > media.priority[i, best]"),

@@ -15,8 +15,9 @@ from .rays import ALL_CHANNELS, MOST_MEDIA, VIEW, Rays, add_medium, new_rays
 def view_ray(scene: Scene, camera: Camera, model: str) -> Rays:
     """One row: a ray of the whole light, without place or direction.
 
-    The eye is in every closed body that is traced and that winds around it; the smallest is entered last, and is what
-    the ray is said to have entered. An orthographic camera has no eye.
+    The eye is in every closed body that winds around it and has a face of traced glass, the first of which says what
+    fills the body; the smallest is entered last, and is what the ray is said to have entered. An orthographic camera
+    has no eye.
 
     Args:
         model: token that overrides all materials' models, or ''.
@@ -28,16 +29,19 @@ def view_ray(scene: Scene, camera: Camera, model: str) -> Rays:
     if camera.orthographic:
         return ray
     eye = camera.world_from_camera[:3, 3]
+    traced = np.array([_is_traced(material, model) for material in scene.materials], np.bool_)
     around: list[tuple[float, int, Material]] = []
     for thing, mesh in enumerate(scene.meshes):
-        if mesh.closed and len(mesh.triangles) and _is_traced(material := scene.materials[mesh.materials[0]], model):
+        of_glass = traced[mesh.materials]
+        if mesh.closed and of_glass.any():
             low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
             near = ((low < eye) & (eye < high)).all()
             if near and winding(eye, mesh.points.astype(np.float64), mesh.triangles) > 0.5:
-                around.append((float(np.prod(high - low)), thing, material))
+                filled_with = scene.materials[mesh.materials[of_glass.argmax()]]
+                around.append((float(np.prod(high - low)), thing, filled_with))
     for k, ball in enumerate(scene.spheres):
-        if _is_traced(material := scene.materials[ball.material], model) and math.dist(ball.centre, eye) < ball.radius:
-            around.append(((2.0 * ball.radius) ** 3, len(scene.meshes) + k, material))
+        if traced[ball.material] and math.dist(ball.centre, eye) < ball.radius:
+            around.append(((2.0 * ball.radius) ** 3, len(scene.meshes) + k, scene.materials[ball.material]))
     for _, thing, material in sorted(around, key=lambda body: -body[0])[-MOST_MEDIA:]:
         r, g, b = (float(c) for c in material.inputs[Param.TRANSMITTANCE].value[:3])
         ior = max(1.0, float(material.inputs[Param.IOR].value[0]))
