@@ -275,12 +275,19 @@ class _Builder:
             self.body("/overlap", _glass(dice, Model.TRACED), place + dice.point(0.6) * size, size)
 
     def around(self, eye: NDArray[np.float64]) -> None:
-        """One or two boxes of traced glass that the eye is in."""
+        """One or two boxes of traced glass that the eye is in; the first of their faces and some more may be of another
+        material."""
         dice = self.dice
         for k in range(dice.pick([1, 1, 2])):
             half, turn = dice.rng.uniform(0.15, 0.25, 3) * (k + 1), turned(dice.point(1.0), dice.number(0, 360))
-            index = self.of(_even(dice, dice.pick([-2, 0, 3]) + k))
-            self.add(box("/around", half, index, turn, eye + dice.point(0.05)))
+            priority = dice.pick([-2, 0, 3]) + k
+            mesh = box("/around", half, self.of(_even(dice, priority)), turn, eye + dice.point(0.05))
+            if dice.chance(0.5):
+                other = self.of(_opaque(dice, False) if dice.chance(0.7) else _even(dice, priority))
+                others = dice.rng.random(len(mesh.triangles)) < 0.3
+                others[0] = True
+                mesh = replace(mesh, materials=np.where(others, other, mesh.materials).astype(np.int32))
+            self.add(mesh)
 
     def thing(self, of: Material, z: float) -> None:
         """A ball, a box on the table, a turned box or a tetrahedron; of glass, sometimes with a second one on it."""

@@ -371,6 +371,21 @@ def test_of_two_bodies_around_the_eye_the_smaller_fills(order: int) -> None:
     np.testing.assert_allclose(planes["path_length"], 0.6, rtol=1e-4)
 
 
+@pytest.mark.parametrize(("ahead", "seen"), [((1, 0, 0), 0.7), ((0, 0, -1), 1.0)], ids=["paint", "glass"])
+def test_not_every_face_of_a_body_around_the_eye_must_be_glass(ahead: tuple[int, int, int], seen: float) -> None:
+    """A tank, painted on the side that comes first, with a pane on the second. What fills it is the first traced glass,
+    up to the paint, and up to a face of other traced glass, with a white room behind."""
+    walls, materials = constant_room()
+    glasses = [glass(Model.TRACED, 1.0, TRANSMITTANCE=tint, absorption_distance=0.1) for tint in (0.6, 0.9)]
+    kinds = [*materials, material("/paint", EMISSIVE=0.7), glass(Model.THIN), *glasses]
+    sides = np.array([1, 2, 3, 4, 3, 4], np.int32)  # +x, -x, +y, -y, +z, -z
+    tank = replace(box("/tank", (0.4, 0.4, 0.4), 1, centre=(0, 0, 1)), materials=np.repeat(sides, 2))
+    lens = camera((0, 0, 1), np.add((0, 0, 1), ahead), fov=0.01, clipping=(1e-5, 100))
+    planes = draw(scene([*walls, tank], kinds, cameras=(lens,)), 1, 1, tiers=("ray",))
+    np.testing.assert_allclose(planes["beauty"][0, 0, :3], seen * 0.6**4, rtol=1e-3)
+    np.testing.assert_allclose(planes["path_length"], 0.4, rtol=1e-4)
+
+
 # --- Alpha ------------------------------------------------------------------------------------------------------------
 
 

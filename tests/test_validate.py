@@ -19,7 +19,6 @@ from typer.testing import CliRunner, Result
 import schemas
 from refract_core.cli import app
 from refract_core.probes.digest import probe_digest
-from refract_core.thickness.solid import is_convex, signed_volume, winding
 from refract_core.usd.rules import plugin as rules_plugin
 from refract_core.usd.rules.findings import Finding
 from refract_core.usd.rules.glass import sides
@@ -27,6 +26,7 @@ from refract_core.usd.rules.stage import RULES, stage_findings, stock_findings
 from refract_core.usd.stage import load_stage, open_stage
 from refract_core.verbs.validate import ValidateOrder, validate
 from refract_core.version import __version__
+from refract_core.world.solid import is_convex, signed_volume, winding
 
 SAMPLES = Path(__file__).parents[1] / "usd_samples"
 FOLDER = SAMPLES / "bad" / "validate"

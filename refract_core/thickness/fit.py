@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ..models import Behind, Model, model_for
 from ..scene import F64
-from .solid import crossings, is_convex, signed_volume
+from ..world.solid import crossings, is_convex, signed_volume
 
 SPHERE_RESIDUAL = 0.05
 """A ball: root mean square distance of the surface from the best sphere, against its radius."""

@@ -451,7 +451,6 @@ def _draw_edges(
         for slot in range(taken):
             x, y = cell.x[slot], cell.y[slot]
             add_light(planes, cell, slot, x, y)
-            planes.confidence[y, x] = 1000.0
             if cell.glass[slot] != 0:
                 add_glass(planes, cell, slot, x, y, 1.0)
             if cell.sample[slot] == 0:

@@ -31,18 +31,17 @@ from .rays import (
     THROUGH_SIDE,
     VIEW,
     Rays,
+    abbe_in,
     absorb,
     add_medium,
     channel_ior,
     copy_ray,
     drop_medium,
     filling,
+    filling_without,
     index_in,
     slot_of,
 )
-
-MOST_MET = 128
-"""Pieces of glass that a ray may meet before it is given up."""
 
 _LATE = 96
 """Pieces after which a ray is let out at the next occasion."""
@@ -229,16 +228,11 @@ def _turn(meeting: Meeting, lane: int, at: Interaction, world: World, d: Vec, en
 def cross(meeting: Meeting, lane: int, now: Rays, rules: Rules) -> None:
     """Split a ray at an interface: weights and directions of what is mirrored and of what goes through."""
     media, d = now.media, row(now.direction, lane)
+    leaves = meeting.kind[lane] == LEFT
     before = filling(media, lane)
-    behind = AIR
-    if meeting.kind[lane] == LEFT:
-        behind = _filling_without(now, lane, meeting.slot[lane])
-    abbe_behind = 0.0
-    if meeting.kind[lane] != LEFT:
-        abbe_behind = meeting.abbe[lane]
-    elif behind != AIR:
-        abbe_behind = media.abbe[lane, behind]
-    abbe_before = 0.0 if before == AIR else media.abbe[lane, before]
+    behind = filling_without(media, lane, meeting.slot[lane]) if leaves else AIR
+    abbe_before = abbe_in(media, lane, before)
+    abbe_behind = abbe_in(media, lane, behind) if leaves else meeting.abbe[lane]
     channel = now.channel[lane]
     splits = channel == ALL_CHANNELS and (abbe_before > 0.0 or abbe_behind > 0.0)
     meeting.channels[lane] = 3 if splits else 1
@@ -246,10 +240,7 @@ def cross(meeting: Meeting, lane: int, now: Rays, rules: Rules) -> None:
         k = c if splits else channel
         if c == 0 or splits:
             n1 = index_in(media, lane, before, k)
-            if meeting.kind[lane] == LEFT:
-                n2 = index_in(media, lane, behind, k)
-            else:
-                n2 = channel_ior(meeting.ior[lane], meeting.abbe[lane], k)
+            n2 = index_in(media, lane, behind, k) if leaves else channel_ior(meeting.ior[lane], meeting.abbe[lane], k)
             share = _bend(meeting, lane, c, d, n1, n2)
         _weigh(meeting, lane, now, c, share)
     r = reflect(d, row(meeting.n, lane))
@@ -258,16 +249,6 @@ def cross(meeting: Meeting, lane: int, now: Rays, rules: Rules) -> None:
         r = reflect(d, ng)
     put(meeting.mirrored, lane, r)
     _cut(meeting, lane, rules.cut, now.met[lane] >= _LATE)
-
-
-@inlined
-def _filling_without(now: Rays, lane: int, slot: int) -> int:
-    """The slot of what fills the space once the body in `slot` is left."""
-    best = AIR
-    for k in range(now.media.depth[lane]):
-        if k != slot and (best == AIR or now.media.priority[lane, k] >= now.media.priority[lane, best]):
-            best = k
-    return best
 
 
 @inlined
@@ -284,12 +265,8 @@ def _bend(meeting: Meeting, lane: int, c: int, d: Vec, n1: float, n2: float) -> 
         meeting.length[lane, c] = length
         return fresnel_dielectric(abs(dot(n, d)), n1 / n2)
     passes, out = refract(d, n, n1 / n2)
-    if passes and dot(out, ng) >= 0.0:
-        if meeting.kind[lane] == LEFT:  # a steep shading normal must not keep it in by bending it
-            passes = False
-        else:
-            n = ng
-            passes, out = refract(d, n, n1 / n2)
+    if dot(out, ng) >= 0.0:  # a steep shading normal turns it back: by the true one it is totally reflected
+        passes = False
     put(meeting.through[lane], c, out)
     return fresnel_dielectric(abs(dot(n, d)), n1 / n2) if passes else 1.0
 
@@ -346,7 +323,6 @@ def _follow(to: Rays, i: int, now: Rays, lane: int, meeting: Meeting, step: int)
     to.end[i] = math.inf
     to.inner[i] = 0
     to.met[i] = now.met[lane] + 1
-    to.lost[i] = 1 if to.met[i] >= MOST_MET else 0
     to.travelled[i] += meeting.t[lane]
     to.branch[i] = 4 * now.branch[lane] + step
     to.way[i] = np.int32(hash32(now.way[lane], 4 * meeting.thing[lane] + step, 4 * meeting.kind[lane]))
@@ -449,7 +425,6 @@ def send_past(to: Rays, i: int, now: Rays, lane: int, t: float) -> int:
     copy_ray(to, i, now, lane)
     to.start[i] = past(t)
     to.met[i] = now.met[lane] + 1
-    to.lost[i] = 1 if to.met[i] >= MOST_MET else 0
     return i + 1
 
 

@@ -7,15 +7,17 @@ import math
 import numpy as np
 
 from ..models import BY_TOKEN, Behind
-from ..scene import F32, U32, Camera, Material, Param, Scene
+from ..scene import Camera, Material, Param, Scene
+from ..world.solid import winding
 from .rays import ALL_CHANNELS, MOST_MEDIA, VIEW, Rays, add_medium, new_rays
 
 
 def view_ray(scene: Scene, camera: Camera, model: str) -> Rays:
     """One row: a ray of the whole light, without place or direction.
 
-    The eye is in every closed body that is traced and that winds around it; the smallest is entered last, and is what
-    the ray is said to have entered. An orthographic camera has no eye.
+    The eye is in every closed body that winds around it and has a face of traced glass, the first of which says what
+    fills the body; the smallest is entered last, and is what the ray is said to have entered. An orthographic camera
+    has no eye.
 
     Args:
         model: token that overrides all materials' models, or ''.
@@ -27,15 +29,19 @@ def view_ray(scene: Scene, camera: Camera, model: str) -> Rays:
     if camera.orthographic:
         return ray
     eye = camera.world_from_camera[:3, 3]
+    traced = np.array([_is_traced(material, model) for material in scene.materials], np.bool_)
     around: list[tuple[float, int, Material]] = []
     for thing, mesh in enumerate(scene.meshes):
-        if mesh.closed and len(mesh.triangles) and _is_traced(material := scene.materials[mesh.materials[0]], model):
+        of_glass = traced[mesh.materials]
+        if mesh.closed and of_glass.any():
             low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
-            if ((low < eye) & (eye < high)).all() and winding(mesh.points, mesh.triangles, eye) > 0.5:
-                around.append((float(np.prod(high - low)), thing, material))
+            near = ((low < eye) & (eye < high)).all()
+            if near and winding(eye, mesh.points.astype(np.float64), mesh.triangles) > 0.5:
+                filled_with = scene.materials[mesh.materials[of_glass.argmax()]]
+                around.append((float(np.prod(high - low)), thing, filled_with))
     for k, ball in enumerate(scene.spheres):
-        if _is_traced(material := scene.materials[ball.material], model) and math.dist(ball.centre, eye) < ball.radius:
-            around.append(((2.0 * ball.radius) ** 3, len(scene.meshes) + k, material))
+        if traced[ball.material] and math.dist(ball.centre, eye) < ball.radius:
+            around.append(((2.0 * ball.radius) ** 3, len(scene.meshes) + k, scene.materials[ball.material]))
     for _, thing, material in sorted(around, key=lambda body: -body[0])[-MOST_MEDIA:]:
         r, g, b = (float(c) for c in material.inputs[Param.TRANSMITTANCE].value[:3])
         ior = max(1.0, float(material.inputs[Param.IOR].value[0]))
@@ -46,20 +52,3 @@ def view_ray(scene: Scene, camera: Camera, model: str) -> Rays:
 
 def _is_traced(material: Material, model: str) -> bool:
     return material.refractive and (BY_TOKEN[model] if model else material.model).behind is Behind.MESH
-
-
-def winding(points: F32, triangles: U32, p: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> float:
-    """How often a closed mesh winds around a point: 1 inside, 0 outside, -1 inside of one that is inside out.
-
-    The solid angles of its triangles, summed (Van Oosterom and Strackee, IEEE Trans. Biomed. Eng. 30(2), 1983).
-
-    Args:
-        points: shape (V, 3) [m].
-        triangles: shape (T, 3), counter-clockwise from outside.
-        p: shape (3,) [m].
-    """
-    a, b, c = (points[triangles[:, k]].astype(np.float64) - p for k in range(3))
-    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
-    volume = np.einsum("ij,ij->i", a, np.cross(b, c))
-    ab, bc, ca = (np.einsum("ij,ij->i", u, v) for u, v in ((a, b), (b, c), (c, a)))
-    return float(np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb).sum() / (2.0 * math.pi))

@@ -21,6 +21,8 @@ MOST_MEDIA = 6
 AIR = -1
 """The slot of a medium that is none."""
 ALL_CHANNELS = -1
+MOST_MET = 128
+"""Pieces of glass that a ray may meet before it is lost."""
 OUT_OF_BODY = 2
 """A ray is on an inner stretch, and behind the wall of the real body."""
 
@@ -96,8 +98,6 @@ class Rays(NamedTuple):
     """surfaces that it has entered"""
     met: I32_1D
     """pieces of glass that it has met, passed ones too"""
-    lost: I32_1D
-    """1: it met too many to go on"""
     media: Media
 
 
@@ -138,7 +138,7 @@ def copy_ray(to: Rays, i: int, rays: Rays, j: int) -> None:
     to.inner[i], to.pixel[i], to.branch[i] = rays.inner[j], rays.pixel[j], rays.branch[j]
     to.way[i] = rays.way[j]
     to.channel[i], to.side[i], to.thing[i] = rays.channel[j], rays.side[j], rays.thing[j]
-    to.entered[i], to.met[i], to.lost[i] = rays.entered[j], rays.met[j], rays.lost[j]
+    to.entered[i], to.met[i] = rays.entered[j], rays.met[j]
     to.media.depth[i] = rays.media.depth[j]
     for k in range(rays.media.depth[j]):
         _copy_medium(to.media, i, k, rays.media, j, k)
@@ -153,11 +153,23 @@ def _copy_medium(to: Media, i: int, k: int, media: Media, j: int, l: int) -> Non
 
 
 @inlined
+def is_lost(rays: Rays, i: int) -> bool:
+    """A ray has met too much glass to go on."""
+    return bool(rays.met[i] >= MOST_MET)
+
+
+@inlined
 def filling(media: Media, i: int) -> int:
     """The slot of the medium that fills the space around a ray; AIR where it is in none."""
+    return filling_without(media, i, AIR)
+
+
+@inlined
+def filling_without(media: Media, i: int, slot: int) -> int:
+    """The same once the body in a slot is left."""
     best = AIR
     for k in range(media.depth[i]):
-        if best == AIR or media.priority[i, k] >= media.priority[i, best]:
+        if k != slot and (best == AIR or media.priority[i, k] >= media.priority[i, best]):
             best = k
     return best
 
@@ -183,6 +195,12 @@ def channel_ior(ior: float, abbe: float, channel: int) -> float:
 def index_in(media: Media, i: int, slot: int, channel: int) -> float:
     """Index of the medium in a slot; 1 of air."""
     return 1.0 if slot == AIR else channel_ior(media.ior[i, slot], media.abbe[i, slot], channel)
+
+
+@inlined
+def abbe_in(media: Media, i: int, slot: int) -> float:
+    """Abbe number of the medium in a slot; 0, which is no dispersion, of air."""
+    return 0.0 if slot == AIR else media.abbe[i, slot]
 
 
 @inlined

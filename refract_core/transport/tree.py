@@ -30,7 +30,6 @@ from ..world.tracing import intersect_world
 from .answers import Answers, add_answer, add_glow, new_answers
 from .crossing import (
     LEFT,
-    MOST_MET,
     PASSED,
     Meeting,
     Rules,
@@ -41,7 +40,7 @@ from .crossing import (
     send_past,
     send_through,
 )
-from .rays import MIRRORED_SIDE, THROUGH_SIDE, VIEW, Rays, absorb, copy_ray, new_rays
+from .rays import MIRRORED_SIDE, MOST_MET, THROUGH_SIDE, VIEW, Rays, absorb, copy_ray, is_lost, new_rays
 from .tiers import NONE, PROXY, Asking, Query, TierScratch, ask
 
 CELL = 64
@@ -233,11 +232,12 @@ def _trace(scratch: TreeScratch, world: World, rules: Rules, taken: int) -> None
     together = True
     for lane in range(taken):
         met.part[lane] = NOTHING
-        if now.lost[lane] != 0:  # as if there were no glass at all
+        lost = is_lost(now, lane)
+        if lost:  # as if there were no glass at all
             now.media.depth[lane] = 0
             if now.inner[lane] != 0:
                 now.inner[lane], now.end[lane] = 0, math.inf
-        blind = now.media.depth[lane] == 0 and (now.entered[lane] >= rules.max_layers or now.lost[lane] != 0)
+        blind = now.media.depth[lane] == 0 and (now.entered[lane] >= rules.max_layers or lost)
         scratch.far[lane] = now.end[lane]
         set_ray(
             packet, lane, row(now.origin, lane), row(now.direction, lane), now.start[lane], now.end[lane],
@@ -473,7 +473,7 @@ def _add_leaf(scratch: TreeScratch, world: World, k: int, lane: int, view: View)
     for tier in range(4):
         cell.tiers[i, tier] += share * query.weight[lane, tier]
     cell.tiers[i, NONE] += share * unanswered
-    if leaves.lost[k] == 0:
+    if not is_lost(leaves, k):
         cell.confidence[i] += share * query.confidence[lane]
     cell.share[i] += share
     # By luminance: the three colours that a dispersive glass lets out often have the same weight, but for rounding.

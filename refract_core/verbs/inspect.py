@@ -35,7 +35,6 @@ import numpy as np
 
 from ..models import Behind
 from ..scene import F64, Camera, Param, Source
-from ..thickness.solid import crossings
 from ..usd.materials.read import API
 from ..usd.rules.findings import WARNING, Finding
 from ..usd.rules.glass import Glass
@@ -43,6 +42,7 @@ from ..usd.rules.overview import Overview, overview_of
 from ..usd.rules.probes import share
 from ..usd.values import neat
 from ..version import __version__
+from ..world.solid import crossings
 from .orders import stop_if
 from .validate import SEVERITIES, finding_record
 

@@ -1,4 +1,4 @@
-"""Which pixel shows which glass: the first surface along each view ray, asked of the engine itself.
+"""Which pixel shows which glass: the first surface along the ray through its centre, asked of the engine itself.
 
 The scene is drawn once more, with every glass surface glowing in a number of its own and everything else black, and no
 light, sky or probe: what the pixel holds is then the number of what it shows. So there is no second opinion on what a
@@ -45,7 +45,7 @@ class Owners:
 
 
 def find_owners(scene: Scene, settings: RenderSettings, cancel: Callable[[], bool]) -> Owners:
-    """Who is seen in each pixel of the picture that `settings` would make, by the ray of its first sample.
+    """Who is seen at the centre of each pixel of the picture that `settings` would make, however many samples it has.
 
     Raises:
         UsageError: no such camera.

@@ -1,5 +1,5 @@
 """The packed scene that rays meet: Embree, tables of geometry and materials, textures, lights, the sky, and the light
-that leaves an opaque hit.
+that leaves an opaque hit. And what closed meshes enclose.
 """
 
-__all__ = ["embree", "environment", "lights", "offsets", "shading", "surface", "tables", "textures", "tracing"]
+__all__ = ["embree", "environment", "lights", "offsets", "shading", "solid", "surface", "tables", "textures", "tracing"]

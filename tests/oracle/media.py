@@ -11,7 +11,7 @@ from . import optics
 from .shading import Shader
 from .surface import color, number
 from .vec import Vec, dot, unit
-from .world import GLASS, Hit
+from .world import GLASS, OPAQUE, Face, Hit
 
 MOST = 6
 """Bodies that a ray can be in; one more is passed straight."""
@@ -64,9 +64,13 @@ def disperses(m: Medium | None) -> bool:
 
 
 def model_at(scene: Scene, hit: Hit, override: str) -> Model:
+    return _model_of(scene, hit.face, override)
+
+
+def _model_of(scene: Scene, face: Face, override: str) -> Model:
     """An open mesh has no far side to be traced to."""
-    model = Model[override.upper()] if override else scene.materials[hit.face.material].model
-    return Model.THIN if model is Model.TRACED and hit.face.sheet else model
+    model = Model[override.upper()] if override else scene.materials[face.material].model
+    return Model.THIN if model is Model.TRACED and face.sheet else model
 
 
 def medium_at(scene: Scene, hit: Hit, model: Model) -> Medium:
@@ -87,15 +91,16 @@ def thickness_at(scene: Scene, hit: Hit, model: Model) -> float:
 
 
 def media_around(shader: Shader, eye: Vec, override: str) -> Media:
-    """Closed traced bodies that the eye is in, the largest first. Each has the attributes of the nearest place where
-    one of the eight rays leaves it."""
+    """Closed bodies with traced faces that the eye is in, the largest first. Each has the attributes of the glass of
+    the first such face, at the nearest place where one of the eight rays leaves it."""
     scene = shader.scene
+    glasses = _glasses(shader, override)
     votes: dict[int, int] = {}
     exits: dict[int, Hit] = {}
     for d in _CORNERS:
         more: dict[int, int] = {}
-        for hit in shader.world.candidates(eye, d, 0.0, float("inf"), GLASS):
-            if model_at(scene, hit, override) is not Model.TRACED or not shader.present(hit, eye, d, None):
+        for hit in shader.world.candidates(eye, d, 0.0, float("inf"), OPAQUE | GLASS):
+            if hit.face.thing not in glasses:
                 continue
             thing, leaves = hit.face.thing, dot(hit.ng, d) > 0.0
             more[thing] = more.get(thing, 0) + (1 if leaves else -1)
@@ -104,7 +109,21 @@ def media_around(shader: Shader, eye: Vec, override: str) -> Media:
         for thing, count in more.items():
             votes[thing] = votes.get(thing, 0) + (count > 0)
     around = sorted((thing for thing, n in votes.items() if n >= _ENOUGH), key=lambda thing: -_bounds(shader, thing))
-    return tuple(medium_at(scene, exits[thing], Model.TRACED) for thing in around[-MOST:])
+    return tuple(medium_at(scene, _of_glass(exits[thing], glasses[thing]), Model.TRACED) for thing in around[-MOST:])
+
+
+def _of_glass(hit: Hit, material: int) -> Hit:
+    return hit._replace(face=hit.face._replace(material=material))
+
+
+def _glasses(shader: Shader, override: str) -> dict[int, int]:
+    """The material of the first traced face of each thing that has one."""
+    found: dict[int, int] = {}
+    for body in shader.world.bodies:
+        for face in body.faces:
+            if face.kind == GLASS and _model_of(shader.scene, face, override) is Model.TRACED:
+                found.setdefault(face.thing, face.material)
+    return found
 
 
 def _bounds(shader: Shader, thing: int) -> float:

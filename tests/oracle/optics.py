@@ -74,17 +74,8 @@ class Split(NamedTuple):
     reflectance: float
 
 
-def entering(d: Vec, n: Vec, ng: Vec, eta: float) -> Split:
-    """Into a body, `n` (shading, facing the ray) and `ng` on the ray's side. Into what is thinner, a steep `n` can
-    send the ray back to where it came from: then the true normal decides, about the reflectance too."""
-    through = bent(d, n, eta)
-    if through is not None and dot(through, ng) >= 0.0:
-        n, through = ng, bent(d, ng, eta)
-    return Split(through, 1.0 if through is None else fresnel(clamp(abs(dot(d, n))), eta))
-
-
-def leaving(d: Vec, n: Vec, ng: Vec, eta: float) -> Split:
-    """Out of a body, `n` and `ng` inward, on the ray's side."""
+def crossing(d: Vec, n: Vec, ng: Vec, eta: float) -> Split:
+    """Into a body or out of one, `n` (shading, facing the ray) and `ng` on the ray's side."""
     through = bent(d, n, eta)
     if through is None or dot(through, ng) >= 0.0:
         return Split(None, 1.0)

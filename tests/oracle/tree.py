@@ -331,10 +331,8 @@ class Tree:
         beyond = eta * eta * (1.0 - dot(d, s.ns) ** 2)
         if eta > 1.0 and abs(1.0 - beyond) < _CLOSE and max(ray.weight) >= _HEEDED:
             self.shader.unsure = True
-        if step is Step.LEAVES:
-            return optics.leaving(d, s.ns, s.ng, eta)
-        if step is Step.ENTERS:
-            return optics.entering(d, s.ns, s.ng, eta)
+        if step in (Step.ENTERS, Step.LEAVES):
+            return optics.crossing(d, s.ns, s.ng, eta)
         return Split(None, optics.fresnel(clamp(-dot(d, s.ns)), eta))
 
     def _cut(

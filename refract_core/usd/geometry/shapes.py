@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pxr import Usd, UsdGeom
 
 from ...scene import F32, F64, U32, Notice
-from ...thickness.solid import looks_inwards
+from ...world.solid import looks_inwards
 from . import gprims
 from .primvars import Corners, Topology, Unusable, as_values, evaluate, to_corners
 from .triangulate import Index, Triangles, fans, fans_fit, is_closed, smooth_normals, triangulate, turned_over

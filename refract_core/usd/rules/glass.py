@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ...models import SHEET, Behind, Model, model_for
 from ...scene import F64, Material, Mesh, Param, Scene, Source, Sphere
-from ...thickness.solid import is_convex, winding
+from ...world.solid import is_convex, winding
 from ..geometry.shapes import INWARDS, TURN
 from .findings import ERROR, WARNING, Finding, Rule
 

@@ -10,8 +10,8 @@ from pxr import Usd
 
 from ...probes.digest import stale_bakes
 from ...scene import F64, Probe, Scene, Volume
-from ...thickness.solid import winding
 from ...version import __version__
+from ...world.solid import winding
 from .findings import ERROR, INFO, WARNING, Finding, Rule
 from .glass import Glass
 

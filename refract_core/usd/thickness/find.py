@@ -12,7 +12,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from ...scene import F64, U32, Material, Model, Notice, Param, Texture
 from ...settings import PURPOSES
-from ...thickness.solid import signed_volume
+from ...world.solid import signed_volume
 from ..convert.find import editable, find_glass, original
 from ..diagnostics import captured
 from ..geometry.parts import Bound, bind

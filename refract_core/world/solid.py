@@ -1,4 +1,5 @@
-"""Closed meshes and rays through them, in plain numpy: what fitting, rules and reports ask of a shape.
+"""Closed meshes and rays through them, in plain numpy: what the eye, fitting, rules and reports ask of a
+shape.
 
 Points have shape (V, 3), triangles shape (T, 3); outside is where a triangle's corners run counter-clockwise.
 """
