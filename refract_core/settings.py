@@ -56,6 +56,8 @@ class RenderSettings:
     tolerance: float = 0.03
     """Where the corners of a pixel differ by no more, as the eye sees it, they are the pixel, 0 .. 1; others take all
     samples. 0: every pixel does."""
+    light_samples: int = 16
+    """Rays to a light or to the sky where a pixel's corner sees a part of it, 1 .. 4096."""
     tiers: tuple[str, ...] = ("screen", "probe", "ray", "sky")
     """Order in which refraction and reflection look for their colour."""
     screen: str = "traced"
@@ -85,6 +87,7 @@ class RenderSettings:
                 f"image size {self.image_width} x {self.image_height} is over {MAX_PIXELS} pixels; make it smaller"
             )
         _in_range("samples", self.samples, 1, 4096)
+        _in_range("light_samples", self.light_samples, 1, 4096)
         _in_range("max_layers", self.max_layers, 1, 32)
         _in_range("cut", self.cut, 0.0, 1.0)
         _in_range("tolerance", self.tolerance, 0.0, 1.0)

@@ -79,7 +79,7 @@ FLOOR = ((0, -1, 0), (0, 1, 0), 99.0)
 def _light_seen(screen: Screen, points: F64, facing: F64, out: F64) -> None:
     for i in range(points.shape[0]):
         p = (points[i, 0], points[i, 1], points[i, 2])
-        seen = light_seen(screen, p, (facing[0], facing[1], facing[2]))
+        seen = light_seen(screen, p, (facing[0], facing[1], facing[2]), False)
         out[i, 0] = 1.0 if seen.known else 0.0
         for c in range(3):
             out[i, 1 + c], out[i, 4 + c] = seen.irradiance[c], seen.gloss[c]

@@ -53,8 +53,8 @@ def _columns(record: Any) -> list[Any]:
     return [hints[name] for name in record._fields]
 
 
-def new_lanes(record: type[R]) -> R:
-    """A record of lanes with all its arrays at zero; records inside it too.
+def new_lanes(record: type[R], count: int = LANES) -> R:
+    """A record of lanes with all its arrays at zero; records inside it too. `count`: rows.
 
     A record that needs more than zeros (Embree's packet wants aligned memory) brings its own `fresh()`.
     """
@@ -66,9 +66,9 @@ def new_lanes(record: type[R]) -> R:
     for hint in _columns(record):
         columns = [extra for extra in getattr(hint, "__metadata__", ()) if isinstance(extra, Column)]
         if columns:
-            fields.append(np.zeros((LANES, *columns[0].per_lane), columns[0].dtype))
+            fields.append(np.zeros((count, *columns[0].per_lane), columns[0].dtype))
         else:
-            fields.append(new_lanes(hint))
+            fields.append(new_lanes(hint, count))
     return record(*fields)
 
 

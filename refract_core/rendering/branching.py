@@ -22,9 +22,14 @@ from ..view.camera import Tile, View, corners_of, view_of
 from ..view.gbuffer import OpaqueLayer, ViewScratch, new_hits, opaque_tile
 from ..view.planes import Planes
 from ..view.pyramid import Screen, blur_level, fill_depth_levels, new_blur_scratch, new_screen_buffers
+from ..view.quiet import SIDE as QUIET_SIDE
+from ..view.quiet import Care, QuietScratch, quiet_tile
 from .integrator import Pass
 from .session import Session, is_rough
 from .work import tiles_of
+
+_SKY_STEP = 3.0
+"""Of the tolerance: by how much the share of the sky may change over a cell."""
 
 
 def by_corners(settings: RenderSettings) -> bool:
@@ -79,10 +84,12 @@ class Tree:
         settings, (width, height) = self.settings, self.size
         view = view_of(self.camera, width, height, samples=settings.samples)
         corners = corners_of(view_of(self.camera, width, height))
-        tiles = tiles_of(width + 1, height + 1, settings.tile_size)
-        yield from self._opaque_passes(corners, 0, tiles, 0.2)
+        yield from self._quiet_passes(corners, 0.3)
         exposure = self.camera.exposure_scale * 2.0**settings.exposure
-        refining = by_address(Refining(settings.tolerance, exposure, np.array(pixel_offsets(settings.samples))))
+        offsets, rays = np.array(pixel_offsets(settings.samples)), settings.light_samples
+        refining = by_address(
+            Refining(settings.tolerance, exposure, offsets, rays, max(1, rays // settings.samples))
+        )
         world, asking, samples_view = self.session.world, by_address(self._asking(corners)), by_address(view)
         opaque, target = by_address(self.opaque), by_address(self.planes)
 
@@ -94,7 +101,7 @@ class Tree:
                 )
             )
 
-        yield Pass(draw, self.tiles, 0.8)
+        yield Pass(draw, self.tiles, 0.7)
 
     def _sample_passes(self, view: View, sample: int, share: float) -> Iterator[Pass]:
         yield from self._opaque_passes(view, sample, self.tiles, 0.3 * share)
@@ -106,6 +113,23 @@ class Tree:
             return int(tree_tile(world, asking, self.rules, self.view_ray, tree, tile, sample, opaque, target))
 
         yield Pass(grow, self.tiles, 0.7 * share)
+
+    def _quiet_passes(self, view: View, share: float) -> Iterator[Pass]:
+        """Draw the corners' picture without glass, and what the screen tier reads of it."""
+        world, camera, opaque = self.session.world, by_address(view), by_address(self.opaque)
+        care = by_address(Care(self.settings.light_samples, min(0.5, _SKY_STEP * self.settings.tolerance)))
+        width, height = self.size
+        glassy: list[Tile] = []
+
+        def look(tile: Tile) -> int:
+            rays, glass = quiet_tile(world, camera, scratch(QuietScratch), care, tile, opaque)
+            if glass:
+                glassy.append(tile)
+            return int(rays)
+
+        yield Pass(look, tiles_of(width + 1, height + 1, QUIET_SIDE), share)
+        if TIERS.index("screen") in self.order and glassy:
+            yield Pass(_without_rays, self._levels(), 0.0)
 
     def _opaque_passes(self, view: View, sample: int, tiles: list[Tile], share: float) -> Iterator[Pass]:
         """Draw the picture without glass, and what the screen tier reads of it."""
@@ -126,7 +150,7 @@ class Tree:
         """Whom leaves ask, where `view` has drawn the opaque picture."""
         session, traces = self.session, TIERS.index("ray") in self.order
         screen = Screen(view, *self.screen)
-        return Asking(self.order, self.method, traces, screen, session.probes, session.thing_probe)
+        return Asking(self.order, self.method, traces, self.by_corners, screen, session.probes, session.thing_probe)
 
     def _levels(self) -> list[Callable[[], Any]]:
         """What makes the pyramids above the opaque picture, as far as somebody will read them."""

@@ -59,6 +59,10 @@ class Refining(NamedTuple):
     """of the picture: what light is multiplied with before it is looked at"""
     offsets: F64_2D
     """shape (S, 2): of the samples, from the pixel's middle [pixels]"""
+    corner_rays: int
+    """to each light and to the sky, from strong leaves of a corner"""
+    sample_rays: int
+    """the same, of a sample at an edge"""
 
 
 class CornerScratch(NamedTuple):
@@ -118,7 +122,10 @@ def corner_tile(
         for x0 in range(tile[0], min(tile[2], view.size[0]), PATCH):
             width, height = min(PATCH, view.size[0] - x0), min(PATCH, view.size[1] - y0)
             keep_answers(scratch.answers, True)
-            _draw_corners(scratch, world, asking, rules, view_ray, opaque, x0, y0, width + 1, height + 1)
+            _draw_corners(
+                scratch, world, asking, rules, view_ray, opaque, x0, y0, width + 1, height + 1,
+                refining.corner_rays,
+            )  # fmt: skip
             keep_answers(scratch.answers, False)
             edges = 0
             for j in range(height):
@@ -133,7 +140,7 @@ def corner_tile(
 @inlined
 def _draw_corners(
     scratch: TreeScratch, world: World, asking: Asking, rules: Rules, view_ray: Rays, opaque: OpaqueLayer,
-    x0: int, y0: int, columns: int, rows: int,
+    x0: int, y0: int, columns: int, rows: int, times: int,
 ) -> None:  # fmt: skip
     """Fill the slots of a patch, a row of 33 after the other: blocks of 4x2 corners with glass, cell by cell."""
     view = asking.screen.camera
@@ -152,10 +159,10 @@ def _draw_corners(
                 else:
                     count = start(scratch, view, view_ray, count, slot, x + 0.5, y + 0.5, Key(x, y, 0, 0))
             if count > CELL - LANES:
-                follow(scratch, world, asking, rules, view, count, _GLASS_ONLY)
+                follow(scratch, world, asking, rules, view, count, _GLASS_ONLY, times)
                 count = 0
     if count > 0:
-        follow(scratch, world, asking, rules, view, count, _GLASS_ONLY)
+        follow(scratch, world, asking, rules, view, count, _GLASS_ONLY, times)
     for j in range(rows):
         for i in range(columns):
             slot = j * _ROW + i
@@ -446,7 +453,7 @@ def _draw_edges(
             x, y = x0 + pixel % PATCH, y0 + pixel // PATCH
             px, py = x + 0.5 + refining.offsets[sample, 0], y + 0.5 + refining.offsets[sample, 1]
             start(scratch, view, view_ray, slot, slot, px, py, Key(x, y, 0, sample))
-        follow(scratch, world, asking, rules, view, taken, _ALL)
+        follow(scratch, world, asking, rules, view, taken, _ALL, refining.sample_rays)
         cell = scratch.cell
         for slot in range(taken):
             x, y = cell.x[slot], cell.y[slot]

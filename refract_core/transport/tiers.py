@@ -27,7 +27,7 @@ from ..view.pyramid import Screen
 from ..view.screen import light_seen, screen_blurred, screen_march, screen_proxy
 from ..world.embree import OPAQUE, SCATTERED, Packet, clear, set_ray
 from ..world.environment import prefiltered
-from ..world.shading import Block, load_hits, load_surface, shade
+from ..world.shading import ONE_RAY, Block, load_hits, load_surface, shade
 from ..world.surface import NOTHING, HitLanes, Ray, interaction, kept_hit
 from ..world.tables import World
 from ..world.tracing import intersect_world
@@ -65,7 +65,9 @@ class Query(NamedTuple):
     """perceptual, for HDRP's own mappings"""
     thing: Words
     embedded: Flags
-    """1: the ray is inside a medium, and meets an opaque object there"""
+    """1: the ray is inside a medium, and meets an opaque object there; or it is a view ray"""
+    direct: Flags
+    """1: it is a view ray that has met no glass"""
     strong: Flags
     """1: much of its pixel's light comes this way, so that a ray of its own is worth its price"""
     by_proxy: Flags
@@ -97,6 +99,8 @@ class Asking(NamedTuple):
     """of asking the screen: MARCH, PROXY (reflections march then, as HDRP's own do) or TRACED"""
     traces: bool
     """the ray tier is asked too"""
+    quiet: bool
+    """the light on the screen is without noise, so that no ray of a leaf would know it better"""
     screen: Screen
     probes: ProbeTable
     thing_probe: I32_1D
@@ -148,8 +152,8 @@ def _headroom(query: Query, lane: int) -> float:
 
 
 @inlined
-def ask(query: Query, asking: Asking, work: TierScratch, world: World) -> None:
-    """Fill colour, weight and confidence of every lane that is on."""
+def ask(query: Query, asking: Asking, work: TierScratch, world: World, times: int) -> None:
+    """Fill colour, weight and confidence of every lane that is on. `times`: rays of strong leaves to each light."""
     inside = False
     for lane in range(LANES):
         for c in range(3):
@@ -159,13 +163,16 @@ def ask(query: Query, asking: Asking, work: TierScratch, world: World) -> None:
         query.weight[lane, NONE] = 1.0
         query.confidence[lane] = query.surface_share[lane] = 0.0
         inside = inside or (query.on[lane] != 0 and query.embedded[lane] != 0)
+    for lane in range(LANES):
+        if asking.quiet and query.on[lane] != 0 and query.direct[lane] != 0:
+            _ask_screen_traced(query, lane, asking, work, world)  # it is the eye's own picture
     if inside:  # what lies inside the glass is near, and known to be met: nobody can guess it better than a ray
-        _ask_rays(query, EMBEDDED_ONLY, work, world)
+        _ask_rays(query, EMBEDDED_ONLY, work, world, times)
     order = asking.order
     for i in range(order.shape[0]):
         tier = order[i]
         if tier == RAY:
-            _ask_rays(query, ALL_RAYS, work, world)
+            _ask_rays(query, ALL_RAYS, work, world, times)
             continue
         sky_follows = False
         for j in range(i + 1, order.shape[0]):
@@ -217,12 +224,13 @@ def _ask_screen_traced(query: Query, lane: int, asking: Asking, work: TierScratc
     if hit.part == NOTHING:
         return
     sharp = query.blur[lane] <= 0.0
-    if asking.traces and sharp and (query.strong[lane] != 0 or world.materials.gleams[hit.material] != 0):
+    strong = query.strong[lane] != 0 and not asking.quiet
+    if asking.traces and sharp and (strong or world.materials.gleams[hit.material] != 0):
         return
     screen, surface = asking.screen, work.second
     d = row(query.direction, lane)
     at = interaction(world.geometry, hit, Ray(row(query.origin, lane), d), query.width[lane])
-    seen = light_seen(screen, at.point, flip_towards(at.ng, scale(d, -1.0)))
+    seen = light_seen(screen, at.point, flip_towards(at.ng, scale(d, -1.0)), asking.quiet)
     if not seen.known:
         return
     if not sharp:
@@ -272,17 +280,18 @@ def _ask_probe(query: Query, lane: int, k: int, probes: ProbeTable, world: World
 
 
 @inlined
-def _ask_rays(query: Query, embedded: bool, work: TierScratch, world: World) -> None:
+def _ask_rays(query: Query, embedded: bool, work: TierScratch, world: World, times: int) -> None:
     """Light of what every lane with weight left meets; `embedded` lanes only, or all. A cone sends a ray of its own."""
     packet, second = work.packet, work.second
     clear(packet)
-    some = scatters = False
+    some = scatters = strong = False
     for lane in range(LANES):
         second.on[lane] = work.sent[lane] = 0
         if query.on[lane] == 0 or _headroom(query, lane) <= 1.0 - _SPENT:
             continue
         if embedded and query.embedded[lane] == 0:
             continue
+        strong = strong or query.strong[lane] != 0
         key = key_of(query.key, lane)
         set_key(second.key, lane, key)
         if query.blur[lane] > 0.0:
@@ -308,7 +317,7 @@ def _ask_rays(query: Query, embedded: bool, work: TierScratch, world: World) -> 
             at = interaction(world.geometry, kept_hit(query.met, lane), ray, query.width[lane])
             second.on[lane] = 1
             load_surface(second, lane, at, world, scale(d, -1.0))
-    shade(second, work.third, packet, world, OPAQUE)
+    shade(second, work.third, packet, world, OPAQUE, times if strong else ONE_RAY)
     for lane in range(LANES):
         if second.on[lane] != 0:
             if work.sent[lane] == 2:

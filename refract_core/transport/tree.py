@@ -23,7 +23,7 @@ from ..view.camera import View, pixel_ray
 from ..world.embree import COHERENT, EVERYTHING, OPAQUE, SCATTERED, Packet, clear, has_hit, set_ray
 from ..world.environment import TEXEL_LUMINANCE, radiance
 from ..world.offsets import tie
-from ..world.shading import Block, gather, load_surface
+from ..world.shading import ONE_RAY, Block, gather, load_surface
 from ..world.surface import NOTHING, HitLanes, Ray, hit_in, interaction, keep_hit, kept_hit
 from ..world.tables import World
 from ..world.tracing import intersect_world
@@ -194,13 +194,15 @@ def clear_slot(cell: Cell, i: int) -> None:
 
 @inlined
 def follow(
-    scratch: TreeScratch, world: World, asking: Asking, rules: Rules, view: View, count: int, alone: bool
-) -> None:
+    scratch: TreeScratch, world: World, asking: Asking, rules: Rules, view: View, count: int, alone: bool,
+    times: int,
+) -> None:  # fmt: skip
     """Follow the `count` rays on the stack, and what becomes of them, to their leaves, and ask those.
 
     Args:
         view: whose rays they are; its spread is theirs.
         alone: draw what is opaque and seen without any glass, too; otherwise somebody else has drawn that.
+        times: rays that a strong leaf sends to each light and to the sky.
     """
     stack = scratch.stack
     leaves = 0
@@ -219,9 +221,9 @@ def follow(
                 leaves += 1
         count = _send_all(scratch, rules, count, taken)
         if leaves > _LEAVES - LANES:
-            _ask_all(scratch, world, asking, view, leaves, alone)
+            _ask_all(scratch, world, asking, view, leaves, alone, times)
             leaves = 0
-    _ask_all(scratch, world, asking, view, leaves, alone)
+    _ask_all(scratch, world, asking, view, leaves, alone, times)
 
 
 @inlined
@@ -342,7 +344,7 @@ def _shine(scratch: TreeScratch, world: World, taken: int) -> None:
             set_key(block.key, lane, Key(cell.x[i], cell.y[i], now.branch[lane], cell.sample[i]))
     if not some:
         return
-    gather(block, scratch.packet, world, OPAQUE)
+    gather(block, scratch.packet, world, OPAQUE, ONE_RAY)
     for lane in range(taken):
         if block.on[lane] == 0:
             continue
@@ -393,7 +395,7 @@ def _send_all(scratch: TreeScratch, rules: Rules, count: int, taken: int) -> int
 
 @inlined
 def _ask_all(
-    scratch: TreeScratch, world: World, asking: Asking, view: View, leaves: int, alone: bool
+    scratch: TreeScratch, world: World, asking: Asking, view: View, leaves: int, alone: bool, times: int
 ) -> None:
     """Ask the tiers for the light of the leaves in the list, and add it to their slots."""
     query = scratch.query
@@ -402,7 +404,7 @@ def _ask_all(
             query.on[lane] = 0
             if first + lane < leaves:
                 _load_query(scratch, world, asking, view, first + lane, lane, alone)
-        ask(query, asking, scratch.work, world)
+        ask(query, asking, scratch.work, world, times)
         for lane in range(min(LANES, leaves - first)):
             if query.on[lane] != 0:
                 _add_leaf(scratch, world, first + lane, lane, view)
@@ -433,6 +435,7 @@ def _load_query(
     query.width[lane] = view.spread * (leaves.travelled[k] + scratch.leaf_hits.t[k])
     keep_hit(query.met, lane, kept_hit(scratch.leaf_hits, k))
     inside = leaves.media.depth[k] > 0 and seen
+    query.direct[lane] = 1 if direct else 0
     query.embedded[lane] = 1 if inside or direct else 0
     strongest = max(leaves.weight[k, 0], leaves.weight[k, 1], leaves.weight[k, 2])
     query.strong[lane] = 1 if strongest > _STRONG else 0

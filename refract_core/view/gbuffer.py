@@ -22,7 +22,7 @@ from ..world.embree import (
     set_ray,
 )
 from ..world.environment import radiance
-from ..world.shading import Block, load_hits, shade
+from ..world.shading import ONE_RAY, Block, load_hits, shade
 from ..world.surface import Hit, hit_in
 from ..world.tables import World
 from ..world.tracing import intersect_world
@@ -79,7 +79,8 @@ class OpaqueLayer(NamedTuple):
 
 
 @inlined
-def _is_refractive(world: World, hit: Hit) -> bool:
+def is_refractive(world: World, hit: Hit) -> bool:
+    """The hit is on glass."""
     return world.materials.model[hit.material] != Model.NONE.value
 
 
@@ -121,27 +122,27 @@ def opaque_tile(
                 if packet.valid[lane] == 0:
                     continue
                 layer.glass[y, x] = 0
-                if has_hit(packet, lane) and _is_refractive(world, hit_in(packet, lane, world.geometry)):
+                if has_hit(packet, lane) and is_refractive(world, hit_in(packet, lane, world.geometry)):
                     layer.glass[y, x] = 1
                     behind = True
                     glass += 1
             if behind:
-                _trace_behind_glass(scratch, world, view, x0, y0)
+                trace_behind_glass(scratch, world, view, x0, y0)
             if layer.hits.part.shape[0] > 0:
-                _keep_hits(layer.hits, packet, world, x0, y0, width, height)
+                keep_hits(layer.hits, packet, world, x0, y0, width, height)
             load_hits(block, packet, world, view.spread)
-            shade(block, scratch.second, packet, world, OPAQUE)
-            _write_opaque(layer, block, world, view, x0, y0)
+            shade(block, scratch.second, packet, world, OPAQUE, ONE_RAY)
+            write_opaque(layer, block, world, view, x0, y0)
     return packet.tally[0], glass
 
 
 @inlined
-def _trace_behind_glass(scratch: ViewScratch, world: World, view: View, x0: int, y0: int) -> None:
+def trace_behind_glass(scratch: ViewScratch, world: World, view: View, x0: int, y0: int) -> None:
     """Trace again, glass left out, the lanes that met glass first; the others keep the hits they have."""
     packet = scratch.packet
     for lane in range(LANES):
         scratch.asked[lane] = packet.valid[lane]
-        again = has_hit(packet, lane) and _is_refractive(world, hit_in(packet, lane, world.geometry))
+        again = has_hit(packet, lane) and is_refractive(world, hit_in(packet, lane, world.geometry))
         packet.valid[lane] = 0
         if again:
             x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
@@ -152,7 +153,8 @@ def _trace_behind_glass(scratch: ViewScratch, world: World, view: View, x0: int,
 
 
 @inlined
-def _keep_hits(hits: PictureHits, packet: Packet, world: World, x0: int, y0: int, width: int, height: int) -> None:
+def keep_hits(hits: PictureHits, packet: Packet, world: World, x0: int, y0: int, width: int, height: int) -> None:
+    """Note the hits of a block of pixels, as far as they are within the picture."""
     for lane in range(LANES):
         x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
         if x >= width or y >= height or not has_hit(packet, lane):
@@ -164,7 +166,7 @@ def _keep_hits(hits: PictureHits, packet: Packet, world: World, x0: int, y0: int
 
 
 @inlined
-def _write_opaque(layer: OpaqueLayer, block: Block, world: World, view: View, x0: int, y0: int) -> None:
+def write_opaque(layer: OpaqueLayer, block: Block, world: World, view: View, x0: int, y0: int) -> None:
     """Put the colours of a block into the picture; the sky where nothing was hit."""
     for lane in range(LANES):
         x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH

@@ -31,6 +31,7 @@ binomial filter of 2 texels^2 on each level, and half of a round Gaussian lies w
 _SAME = 0.02  # part of the way from eye to hit by which two pixels of one surface may disagree
 _ALIKE = 0.9  # cosine between normals of what may be one surface
 _COPLANAR = 0.002  # part of the depth by which a point may lie outside of a pixel's plane
+_AGREE = 0.2  # part of the brightest light by which pixels may differ about what falls on a surface
 _SLACK = 1.0  # how far outside its pixel a plane may be met, in pixels' worth of the ray
 
 
@@ -232,7 +233,7 @@ def screen_march(screen: Screen, ray: Cone) -> ScreenLight:
 
 
 @inlined
-def light_seen(screen: Screen, point: Vec, facing: Vec) -> SeenLight:
+def light_seen(screen: Screen, point: Vec, facing: Vec, agreeing: bool) -> SeenLight:
     """The light that the picture shows to fall on the very place where a ray is known to end.
 
     A pixel shows that surface if it sees one that faces the same way, and in whose plane the point lies. Half of the
@@ -242,6 +243,8 @@ def light_seen(screen: Screen, point: Vec, facing: Vec) -> SeenLight:
     Args:
         point: where the ray meets the surface [m].
         facing: unit geometric normal there, on the ray's side.
+        agreeing: only where the pixels agree about it. If it is noisy that must not be asked: it would favour the
+            brightest and the darkest.
     """
     width, height = int(screen.camera.size[0]), int(screen.camera.size[1])
     px, py, z = project(screen.camera, point)
@@ -249,7 +252,7 @@ def light_seen(screen: Screen, point: Vec, facing: Vec) -> SeenLight:
     if z <= 0.0 or not (x >= 0.0 and y >= 0.0 and x < width - 1 and y < height - 1):
         return _DARK
     x0, y0 = math.floor(x), math.floor(y)
-    total = 0.0
+    total, low, high = 0.0, math.inf, 0.0
     irradiance, gloss = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     for k in range(4):
         ix, iy = x0 + k % 2, y0 + k // 2
@@ -261,9 +264,11 @@ def light_seen(screen: Screen, point: Vec, facing: Vec) -> SeenLight:
             continue
         w = (x - x0 if k % 2 else 1.0 - x + x0) * (y - y0 if k // 2 else 1.0 - y + y0)
         total += w
-        irradiance = along(irradiance, row(screen.irradiance[iy], ix), w)
+        light = row(screen.irradiance[iy], ix)
+        irradiance = along(irradiance, light, w)
+        low, high = min(low, light[0] + light[1] + light[2]), max(high, light[0] + light[1] + light[2])
         gloss = along(gloss, row(screen.gloss[iy], ix), w)
-    if total < 0.5:
+    if total < 0.5 or (agreeing and high - low > _AGREE * high):
         return _DARK
     return SeenLight(True, px, py, z, scale(irradiance, 1.0 / total), scale(gloss, 1.0 / total))
 

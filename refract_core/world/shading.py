@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from ..kernels.compile import inlined
+from ..kernels.compile import inlined, word
 from ..kernels.lanes import LANES, Flags, Scalars, Vectors, put
 from ..kernels.sampling import MIRRORED, Key, Keys, Purpose, branched, key_of, set_key, unit_pair
 from ..kernels.vec import Vec, add, dot, flip_towards, frame, lerp, mul, normalize, row, scale, sub
@@ -31,6 +31,8 @@ _POLISHED_ROUGHNESS = 0.2
 take their reflection from the environment map alone."""
 _COAT_F0 = 0.04  # a clear coat of ior 1.5 (UsdPreviewSurface)
 _COSINE_CANDIDATES = 2
+ONE_RAY = word(1)
+"""To each light: where a picture takes many samples."""
 
 
 class Block(NamedTuple):
@@ -84,8 +86,12 @@ class Block(NamedTuple):
     """irradiance per radiance of the light, if nothing is in the way [sr]"""
     lamp_specular: Scalars
     """highlight per radiance of the light, without Fresnel, if nothing is in the way"""
+    lamp_asked: Flags
+    """1 where it would bring anything, and casts shadows"""
     lamp_seen: Scalars
-    """1 where nothing is in the way"""
+    """share of it that nothing stands before, 0 .. 1"""
+    free: Scalars
+    """1 where nothing stands before one point of it, or of the sky"""
 
     # Within `shade`, for the mirror bounce.
     bounced: Flags
@@ -153,6 +159,24 @@ def load_surface(block: Block, lane: int, at: Interaction, world: World, wo: Vec
 
 
 @inlined
+def copy_lane(to: Block, i: int, block: Block, lane: int) -> None:
+    """A surface, and the light that has been gathered for it, into another block."""
+    to.on[i], to.matte[i] = block.on[lane], block.matte[lane]
+    put(to.point, i, row(block.point, lane))
+    put(to.ng, i, row(block.ng, lane))
+    put(to.ns, i, row(block.ns, lane))
+    put(to.wo, i, row(block.wo, lane))
+    put(to.albedo, i, row(block.albedo, lane))
+    put(to.f0, i, row(block.f0, lane))
+    put(to.emissive, i, row(block.emissive, lane))
+    to.roughness[i], to.coat[i] = block.roughness[lane], block.coat[lane]
+    to.coat_roughness[i], to.occlusion[i] = block.coat_roughness[lane], block.occlusion[lane]
+    to.distance[i], to.sky_seen[i] = block.distance[lane], block.sky_seen[lane]
+    put(to.diffuse, i, row(block.diffuse, lane))
+    put(to.specular, i, row(block.specular, lane))
+
+
+@inlined
 def _fresnel(f0: Vec, roughness: float, cosine: float) -> Vec:
     """Schlick with its grazing value lowered for rough surfaces (Lagarde 2011) and for those that hardly reflect."""
     x = (1.0 - min(1.0, cosine)) ** 5
@@ -165,82 +189,129 @@ def _fresnel(f0: Vec, roughness: float, cosine: float) -> Vec:
 
 
 @inlined
-def _gather_lights(block: Block, packet: Packet, world: World, mask: int) -> None:
+def forget_light(block: Block, lane: int) -> None:
+    """Nothing has arrived yet."""
+    for c in range(3):
+        block.diffuse[lane, c] = block.specular[lane, c] = 0.0
+    block.sky_seen[lane] = 1.0
+
+
+@inlined
+def _gather_lights(block: Block, packet: Packet, world: World, mask: int, times: int) -> None:
     """Add every light's irradiance to `diffuse` and its highlights to `specular`, with shadows."""
     lights = world.lights
-    for lane in range(LANES):
-        for c in range(3):
-            block.diffuse[lane, c] = 0.0
-            block.specular[lane, c] = 0.0
     for l in range(lights.kind.shape[0]):  # noqa: E741
-        clear(packet)
         for lane in range(LANES):
-            block.lamp_diffuse[lane] = block.lamp_specular[lane] = 0.0
+            block.lamp_asked[lane] = 0
             block.lamp_seen[lane] = 1.0
-            if block.on[lane] == 0:
-                continue
-            p, n, wo = row(block.point, lane), row(block.ns, lane), row(block.wo, lane)
-            if block.matte[lane] != 0:
-                block.lamp_diffuse[lane] = irradiance_factor(lights, l, p, n) * lights.diffuse[l]
-            gloss = block.roughness[lane]
-            block.lamp_specular[lane] = highlight(lights, l, p, n, wo, gloss * gloss) * lights.specular[l]
-            # A clear coat has a highlight of its own, where the rest of the surface may have none.
-            arrives = block.lamp_diffuse[lane] + block.lamp_specular[lane] > 0.0 or block.coat[lane] > 0.0
-            if arrives and lights.casts_shadow[l] != 0:
-                u1, u2 = unit_pair(key_of(block.key, lane), Purpose.LIGHT.value + l)
-                direction, distance = shadow_ray(lights, l, p, u1, u2)
-                add_shadow_ray(packet, lane, p, row(block.ng, lane), direction, distance)
-        if lights.casts_shadow[l] != 0:
-            visible(packet, world, mask, block.lamp_seen)
-        _add_light(block, lights, l)
+            if block.on[lane] != 0 and aim_light(block, lane, lights, l) and lights.casts_shadow[l] != 0:
+                block.lamp_asked[lane] = 1
+                block.lamp_seen[lane] = 0.0
+        for k in range(times if lights.casts_shadow[l] != 0 else 0):
+            clear(packet)
+            for lane in range(LANES):
+                if block.lamp_asked[lane] != 0:
+                    add_light_ray(block, lane, lights, l, packet, lane, nth(key_of(block.key, lane), k, times))
+            visible(packet, world, mask, block.free)
+            for lane in range(LANES):
+                if block.lamp_asked[lane] != 0:
+                    block.lamp_seen[lane] += block.free[lane] / times
+        for lane in range(LANES):
+            if block.on[lane] != 0:
+                add_light(block, lane, lights, l)
 
 
 @inlined
-def _add_light(block: Block, lights: LightTable, l: int) -> None:  # noqa: E741
-    """Add one light, whose share of each hit is known, to the sums."""
-    radiance = row(lights.radiance, l)
-    for lane in range(LANES):
-        if block.on[lane] == 0 or block.lamp_seen[lane] == 0.0:
-            continue
-        n, wo, p = row(block.ns, lane), row(block.wo, lane), row(block.point, lane)
-        f = _fresnel(row(block.f0, lane), block.roughness[lane], max(0.0, dot(n, wo)))
-        coat = block.coat[lane]
-        coat_light = 0.0
-        if coat > 0.0:
-            gloss = block.coat_roughness[lane]
-            fc = coat * (_COAT_F0 + (1.0 - _COAT_F0) * (1.0 - min(1.0, max(0.0, dot(n, wo)))) ** 5)
-            coat_light = fc * highlight(lights, l, p, n, wo, gloss * gloss) * lights.specular[l]
-        for c in range(3):
-            block.diffuse[lane, c] += radiance[c] * block.lamp_diffuse[lane]
-            block.specular[lane, c] += radiance[c] * (block.lamp_specular[lane] * f[c] + coat_light)
+def nth(key: Key, k: int, times: int) -> Key:
+    """The key of ray `k` of the `times` that are sent where others send one."""
+    return Key(key.x, key.y, key.branch, key.sample * times + k)
 
 
 @inlined
-def _gather_sky(block: Block, packet: Packet, world: World, mask: int) -> None:
+def aim_light(block: Block, lane: int, lights: LightTable, l: int) -> bool:  # noqa: E741
+    """Note what a light would bring to a hit if nothing were in the way. Whether that is anything."""
+    block.lamp_diffuse[lane] = 0.0
+    p, n, wo = row(block.point, lane), row(block.ns, lane), row(block.wo, lane)
+    if block.matte[lane] != 0:
+        block.lamp_diffuse[lane] = irradiance_factor(lights, l, p, n) * lights.diffuse[l]
+    gloss = block.roughness[lane]
+    block.lamp_specular[lane] = highlight(lights, l, p, n, wo, gloss * gloss) * lights.specular[l]
+    # A clear coat has a highlight of its own, where the rest of the surface may have none.
+    return block.lamp_diffuse[lane] + block.lamp_specular[lane] > 0.0 or block.coat[lane] > 0.0
+
+
+@inlined
+def add_light_ray(
+    block: Block, i: int, lights: LightTable, l: int, packet: Packet, lane: int, key: Key  # noqa: E741
+) -> None:
+    """Put a ray from hit `i` to a point of a light into a lane."""
+    u1, u2 = unit_pair(key, Purpose.LIGHT.value + l)
+    p = row(block.point, i)
+    direction, distance = shadow_ray(lights, l, p, u1, u2)
+    add_shadow_ray(packet, lane, p, row(block.ng, i), direction, distance)
+
+
+@inlined
+def add_light(block: Block, lane: int, lights: LightTable, l: int) -> None:  # noqa: E741
+    """Add one light, whose share of the hit is known, to its sums."""
+    seen = block.lamp_seen[lane]
+    if seen == 0.0:
+        return
+    radiance = scale(row(lights.radiance, l), seen)
+    n, wo, p = row(block.ns, lane), row(block.wo, lane), row(block.point, lane)
+    f = _fresnel(row(block.f0, lane), block.roughness[lane], max(0.0, dot(n, wo)))
+    coat = block.coat[lane]
+    coat_light = 0.0
+    if coat > 0.0:
+        gloss = block.coat_roughness[lane]
+        fc = coat * (_COAT_F0 + (1.0 - _COAT_F0) * (1.0 - min(1.0, max(0.0, dot(n, wo)))) ** 5)
+        coat_light = fc * highlight(lights, l, p, n, wo, gloss * gloss) * lights.specular[l]
+    for c in range(3):
+        block.diffuse[lane, c] += radiance[c] * block.lamp_diffuse[lane]
+        block.specular[lane, c] += radiance[c] * (block.lamp_specular[lane] * f[c] + coat_light)
+
+
+@inlined
+def _gather_sky(block: Block, packet: Packet, world: World, mask: int, times: int) -> None:
     """Add the environment's irradiance to `diffuse`. Its unoccluded value is exact; how much of it arrives is asked
-    along one direction, chosen in proportion to what it would bring (`_sky_direction`). The same answer dims the sky's
+    along directions chosen in proportion to what they would bring (`_sky_direction`). The same answer dims the sky's
     highlight (`_add_gloss_of_sky`)."""
     environment = world.environment
-    seen = block.sky_seen
-    for lane in range(LANES):
-        seen[lane] = 1.0
     if not environment.present or environment.dark:
         return
-    clear(packet)
     for lane in range(LANES):
-        if block.on[lane] == 0 or block.matte[lane] == 0:
-            continue
-        direction = _sky_direction(environment, row(block.ns, lane), key_of(block.key, lane))
-        add_shadow_ray(packet, lane, row(block.point, lane), row(block.ng, lane), direction, math.inf)
-    visible(packet, world, mask, seen)
+        block.sky_seen[lane] = 0.0 if block.on[lane] != 0 and block.matte[lane] != 0 else 1.0
+    for k in range(times):
+        clear(packet)
+        for lane in range(LANES):
+            if block.on[lane] != 0 and block.matte[lane] != 0:
+                add_sky_ray(block, lane, environment, packet, lane, nth(key_of(block.key, lane), k, times))
+        visible(packet, world, mask, block.free)
+        for lane in range(LANES):
+            if block.on[lane] != 0 and block.matte[lane] != 0:
+                block.sky_seen[lane] += block.free[lane] / times
     for lane in range(LANES):
-        if block.on[lane] == 0 or block.matte[lane] == 0:
-            continue
-        seen[lane] *= block.occlusion[lane]
-        if seen[lane] > 0.0:
-            e = irradiance(environment, row(block.ns, lane))
-            for c in range(3):
-                block.diffuse[lane, c] += e[c] * seen[lane]
+        if block.on[lane] != 0 and block.matte[lane] != 0:
+            add_sky(block, lane, environment)
+
+
+@inlined
+def add_sky_ray(
+    block: Block, i: int, environment: EnvironmentTable, packet: Packet, lane: int, key: Key
+) -> None:
+    """Put a ray from hit `i` to a place of the sky into a lane."""
+    direction = _sky_direction(environment, row(block.ns, i), key)
+    add_shadow_ray(packet, lane, row(block.point, i), row(block.ng, i), direction, math.inf)
+
+
+@inlined
+def add_sky(block: Block, lane: int, environment: EnvironmentTable) -> None:
+    """Add the sky, whose share is known but for what the material keeps out."""
+    block.sky_seen[lane] *= block.occlusion[lane]
+    if block.sky_seen[lane] > 0.0:
+        e = irradiance(environment, row(block.ns, lane))
+        for c in range(3):
+            block.diffuse[lane, c] += e[c] * block.sky_seen[lane]
 
 
 @inlined
@@ -291,19 +362,24 @@ def _cosine_direction(n: Vec, u1: float, u2: float) -> Vec:
 
 
 @inlined
-def gather(block: Block, packet: Packet, world: World, mask: int) -> None:
+def gather(block: Block, packet: Packet, world: World, mask: int, times: int) -> None:
     """What arrives at every hit: irradiance into `diffuse`, the lights' highlights into `specular`.
 
-    `mask`: what casts shadows. The packet is overwritten.
+    Args:
+        mask: what casts shadows.
+        times: rays to each light and to the sky.
+
+    The packet is overwritten.
     """
-    _gather_lights(block, packet, world, mask)
-    _gather_sky(block, packet, world, mask)
+    for lane in range(LANES):
+        forget_light(block, lane)
+    _gather_lights(block, packet, world, mask, times)
+    _gather_sky(block, packet, world, mask, times)
 
 
 @inlined
-def _shade_without_bounce(block: Block, packet: Packet, world: World, mask: int) -> None:
-    """Emission, lights and environment of every hit in the block."""
-    gather(block, packet, world, mask)
+def _add_matt(block: Block) -> None:
+    """Emission, and the light that has been gathered, of every hit in the block."""
     for lane in range(LANES):
         if block.on[lane] == 0:
             continue
@@ -333,12 +409,23 @@ def _reflects_the_scene(f0: Vec, roughness: float) -> bool:
 
 
 @inlined
-def shade(block: Block, second: Block, packet: Packet, world: World, mask: int) -> None:
+def shade(block: Block, second: Block, packet: Packet, world: World, mask: int, times: int) -> None:
     """Radiance of every hit in `block` into `block.color`. `second` is another block, for what the mirrors show.
 
-    `mask`: what reflections and shadows may meet. The packet is overwritten.
+    Args:
+        mask: what reflections and shadows may meet.
+        times: rays to each light and to the sky.
+
+    The packet is overwritten.
     """
-    _shade_without_bounce(block, packet, world, mask)
+    gather(block, packet, world, mask, times)
+    send_back(block, second, packet, world, mask)
+
+
+@inlined
+def send_back(block: Block, second: Block, packet: Packet, world: World, mask: int) -> None:
+    """The rest of `shade`, once the light has been gathered."""
+    _add_matt(block)
     clear(packet)
     some = False
     for lane in range(LANES):
@@ -366,7 +453,8 @@ def _add_mirrored(block: Block, second: Block, packet: Packet, world: World, mas
         set_key(second.key, lane, branched(key_of(block.key, lane), MIRRORED))
     intersect_world(packet, world, block.bounce_end, SCATTERED)
     load_hits(second, packet, world, 0.0)
-    _shade_without_bounce(second, packet, world, mask)
+    gather(second, packet, world, mask, ONE_RAY)
+    _add_matt(second)
     for lane in range(LANES):
         if block.bounced[lane] == 0:
             continue

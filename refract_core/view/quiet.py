@@ -1,0 +1,395 @@
+"""The opaque picture with quiet light: what stands before a light is asked where that is in doubt, and often there
+(docs/decisions/corners.md).
+
+Light that nothing stands before is known in closed form (`world.lights`, `world.environment`); what has to be found by
+rays is the share of it that arrives. Of a lamp that is all or nothing nearly everywhere: one ray per place *finds*
+where places disagree, and only there, in a penumbra, many are sent. Of the sky it changes slowly: it is asked in the
+corners of cells, with many rays, and cells whose corners disagree are cut in four.
+
+A place's rays belong to a net of its 4x4 neighbours, one (0,2)-sequence from which each takes its own run of points. So
+neighbours complement each other. What comes out hangs on the place alone, not on how the picture is cut into tiles.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ..kernels.arrays import F64_1D, I32_1D, I32_2D
+from ..kernels.compile import inlined, kernel
+from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Flags, Scalars, new_lanes
+from ..kernels.sampling import Key, set_key
+from ..kernels.vec import dot, length, row, sub
+from ..world.embree import COHERENT, EVERYTHING, OPAQUE, clear, has_hit
+from ..world.shading import (
+    Block,
+    add_light,
+    add_light_ray,
+    add_sky,
+    add_sky_ray,
+    aim_light,
+    copy_lane,
+    forget_light,
+    load_hits,
+    send_back,
+)
+from ..world.surface import hit_in
+from ..world.tables import World
+from ..world.tracing import intersect_world, visible
+from .camera import Tile, View
+from .gbuffer import OpaqueLayer, ViewScratch, add_view_ray, is_refractive, keep_hits, trace_behind_glass, write_opaque
+
+SIDE = 64
+"""Pixels along the side of a tile."""
+_MARGIN = 2
+"""Pixels around it whose finders' rays matter; the last cells need one, too."""
+_SPAN = SIDE + 1 + 2 * _MARGIN
+_CELL = 16
+"""Pixels between the nodes of the largest cells."""
+_LEVELS = 4
+_ALIKE = 0.95
+"""Cosine of normals between which light is interpolated."""
+_FLAT = 0.1
+"""Part of their distance by which places may lie outside of each other's plane."""
+_NET = 1 << 16
+"""Branch of the sequences of nets."""
+
+
+class QuietScratch(NamedTuple):
+    """What one thread needs to light a tile; N is the places in it and around it, row by row."""
+
+    looking: ViewScratch
+    places: Block
+    """N rows: their surfaces, and the light that has been found for them"""
+    part: I32_1D
+    """shape (N,): Embree geometry; -1 where there is nothing"""
+    found: F64_1D
+    """shape (N,): what the finder's ray says, 1 or 0; -1 where the light would bring nothing"""
+    rays: I32_1D
+    """shape (N,): 1 where the share of the sky is known"""
+    open: F64_1D
+    """shape (N,): and that share"""
+    cells: I32_2D
+    """shape (64, 4): cells yet to be done: first and last column and row"""
+    which: Flags
+    """places of a packet's lanes"""
+    free: Scalars
+    """1 where nothing is in the way"""
+
+    @staticmethod
+    def fresh() -> QuietScratch:
+        """All of it at zero."""
+        count = _SPAN * _SPAN
+        return QuietScratch(
+            new_lanes(ViewScratch), new_lanes(Block, count), np.zeros(count, np.int32), np.zeros(count),
+            np.zeros(count, np.int32), np.zeros(count), np.zeros((64, 4), np.int32),
+            np.zeros(LANES, np.int32), np.zeros(LANES),
+        )  # fmt: skip
+
+
+class Care(NamedTuple):
+    """How much is asked."""
+
+    rays: int
+    """to a lamp from a place in a penumbra, and to the sky from a node; nodes of large cells send up to 16 times more"""
+    step: float
+    """share of the sky by which the corners of a cell may differ"""
+
+
+@kernel
+def quiet_tile(
+    world: World, view: View, scratch: QuietScratch, care: Care, tile: Tile, layer: OpaqueLayer
+) -> tuple[int, int]:
+    """Fill `layer` over a tile of at most 64x64 pixels. Returns (rays traced, pixels with glass before them)."""
+    packet = scratch.looking.packet
+    packet.tally[0] = 0
+    x0, y0 = tile[0], tile[1]
+    x1, y1 = min(tile[2], view.size[0]), min(tile[3], view.size[1])
+    glass = _look(scratch, world, view, layer, x0, y0, x1, y1)
+    for l in range(world.lights.kind.shape[0]):  # noqa: E741
+        _light(scratch, world, view, care, l, x0, y0, x1, y1)
+    if world.environment.present and not world.environment.dark:
+        _find_sky(scratch, world, view, care, x0, y0, x1, y1)
+        for y in range(y0, y1):
+            for x in range(x0, x1):
+                i = _place(x - x0, y - y0)
+                if scratch.part[i] >= 0:
+                    scratch.places.sky_seen[i] = scratch.open[i]
+                    add_sky(scratch.places, i, world.environment)
+    _send(scratch, world, view, layer, x0, y0, x1, y1)
+    return packet.tally[0], glass
+
+
+@inlined
+def _place(i: int, j: int) -> int:
+    """Row of the place in column i and row j of the tile."""
+    return (j + _MARGIN) * _SPAN + i + _MARGIN
+
+
+@inlined
+def _look(
+    scratch: QuietScratch, world: World, view: View, layer: OpaqueLayer, x0: int, y0: int, x1: int, y1: int
+) -> int:
+    """Find the surfaces of the tile and of its margin. Returns the pixels of the tile with glass before them."""
+    looking, places = scratch.looking, scratch.places
+    packet, block, far = looking.packet, looking.block, looking.far
+    width, height = view.size[0], view.size[1]
+    glass = 0
+    for k in range(_SPAN * _SPAN):
+        scratch.part[k] = -1
+    # The margin on the left and above is as wide as a block, so that blocks stand where those of the tile do.
+    for by in range(y0 - BLOCK_HEIGHT, y1 + _MARGIN + 1, BLOCK_HEIGHT):
+        for bx in range(x0 - BLOCK_WIDTH, x1 + _MARGIN + 1, BLOCK_WIDTH):
+            clear(packet)
+            for lane in range(LANES):
+                x, y = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
+                wanted = x0 - _MARGIN <= x <= x1 + _MARGIN and y0 - _MARGIN <= y <= y1 + _MARGIN
+                if wanted and 0 <= x < width and 0 <= y < height:
+                    far[lane] = add_view_ray(packet, view, lane, x, y, EVERYTHING)
+            intersect_world(packet, world, far, COHERENT)
+            behind = False
+            for lane in range(LANES):
+                x, y = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
+                if packet.valid[lane] == 0:
+                    continue
+                refractive = has_hit(packet, lane) and is_refractive(world, hit_in(packet, lane, world.geometry))
+                behind = behind or refractive
+                if x0 <= x < x1 and y0 <= y < y1:
+                    layer.glass[y, x] = 1 if refractive else 0
+                    glass += 1 if refractive else 0
+            if behind:
+                trace_behind_glass(looking, world, view, bx, by)
+            if x0 <= bx and y0 <= by:
+                keep_hits(layer.hits, packet, world, bx, by, x1, y1)
+            load_hits(block, packet, world, view.spread)
+            for lane in range(LANES):
+                x, y = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
+                if block.on[lane] == 0:
+                    continue
+                i = _place(x - x0, y - y0)
+                copy_lane(places, i, block, lane)
+                forget_light(places, i)
+                scratch.part[i] = hit_in(packet, lane, world.geometry).part
+    return glass
+
+
+@inlined
+def _alike(scratch: QuietScratch, i: int, j: int, cosine: float) -> bool:
+    """Two places lie on one smooth piece of a surface."""
+    places = scratch.places
+    if scratch.part[i] != scratch.part[j] or dot(row(places.ng, i), row(places.ng, j)) < cosine:
+        return False
+    between = sub(row(places.point, i), row(places.point, j))
+    return abs(dot(between, row(places.ng, i))) <= _FLAT * length(between)
+
+
+@inlined
+def _net_key(x: int, y: int, k: int, rays: int) -> Key:
+    """The key of ray `k` of `rays` that a place sends as one of a net of 4x4."""
+    turn = (x & 1) | (y & 1) << 1 | (x & 2) << 1 | (y & 2) << 2
+    return Key(x >> 2, y >> 2, _NET, turn * rays + k)
+
+
+# --- lamps --------------------------------------------------------------------------------------------------------
+
+
+@inlined
+def _light(
+    scratch: QuietScratch, world: World, view: View, care: Care, l: int, x0: int, y0: int, x1: int, y1: int  # noqa: E741
+) -> None:
+    """Add one light to every place of the tile."""
+    lights, places, found = world.lights, scratch.places, scratch.found
+    shadows = lights.casts_shadow[l] != 0
+    _find(scratch, world, l, x0, y0, x1, y1)
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            i = _place(x - x0, y - y0)
+            if scratch.part[i] < 0 or found[i] < 0.0:
+                continue
+            places.lamp_seen[i] = found[i]
+            if shadows and _in_doubt(scratch, i):
+                places.lamp_seen[i] = _share_of_lamp(scratch, world, care.rays, l, i, x, y)
+            add_light(places, i, lights, l)
+
+
+@inlined
+def _find(scratch: QuietScratch, world: World, l: int, x0: int, y0: int, x1: int, y1: int) -> None:  # noqa: E741
+    """Send one ray to a light from every place to which it would bring anything, the margin's too."""
+    lights, places, packet = world.lights, scratch.places, scratch.looking.packet
+    shadows = lights.casts_shadow[l] != 0
+    for by in range(y0 - BLOCK_HEIGHT, y1 + _MARGIN, BLOCK_HEIGHT):
+        for bx in range(x0 - BLOCK_WIDTH, x1 + _MARGIN, BLOCK_WIDTH):
+            clear(packet)
+            some = False
+            for lane in range(LANES):
+                x, y = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
+                if not (x0 - _MARGIN <= x < x1 + _MARGIN and y0 - _MARGIN <= y < y1 + _MARGIN):
+                    continue
+                i = _place(x - x0, y - y0)
+                if scratch.part[i] < 0:
+                    continue
+                scratch.found[i] = -1.0
+                if aim_light(places, i, lights, l):
+                    scratch.found[i] = 1.0
+                    if shadows:
+                        some = True
+                        add_light_ray(places, i, lights, l, packet, lane, _net_key(x, y, 0, 1))
+            if not some:
+                continue
+            visible(packet, world, OPAQUE, scratch.free)
+            for lane in range(LANES):
+                x, y = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
+                if packet.valid[lane] != 0:
+                    scratch.found[_place(x - x0, y - y0)] = scratch.free[lane]
+
+
+@inlined
+def _in_doubt(scratch: QuietScratch, i: int) -> bool:
+    """A neighbour on the same surface, at most two pixels away, sees another thing of the light."""
+    for dy in range(-_MARGIN, _MARGIN + 1):
+        for dx in range(-_MARGIN, _MARGIN + 1):
+            j = i + dy * _SPAN + dx
+            if scratch.part[j] == scratch.part[i] and scratch.found[j] >= 0.0 and scratch.found[j] != scratch.found[i]:
+                return True
+    return False
+
+
+@inlined
+def _share_of_lamp(scratch: QuietScratch, world: World, rays: int, l: int, i: int, x: int, y: int) -> float:  # noqa: E741
+    """The share of a light that a place sees, by many rays."""
+    packet, total = scratch.looking.packet, 0.0
+    for first in range(0, rays, LANES):
+        clear(packet)
+        for lane in range(min(LANES, rays - first)):
+            add_light_ray(scratch.places, i, world.lights, l, packet, lane, _net_key(x, y, first + lane, rays))
+        visible(packet, world, OPAQUE, scratch.free)
+        for lane in range(min(LANES, rays - first)):
+            total += scratch.free[lane]
+    return total / rays
+
+
+# --- the sky ------------------------------------------------------------------------------------------------------
+
+
+@inlined
+def _find_sky(
+    scratch: QuietScratch, world: World, view: View, care: Care, x0: int, y0: int, x1: int, y1: int
+) -> None:
+    """The share of the sky that every place of the tile sees: cells of 16x16 pixels, cut in four where they must be."""
+    for k in range(_SPAN * _SPAN):
+        scratch.rays[k] = 0
+    last_x, last_y = min(x1, view.size[0] - 1), min(y1, view.size[1] - 1)
+    for cy in range(y0, y1, _CELL):
+        for cx in range(x0, x1, _CELL):
+            cells = scratch.cells
+            cells[0, 0], cells[0, 1] = cx - x0, cy - y0
+            cells[0, 2], cells[0, 3] = min(cx + _CELL, last_x) - x0, min(cy + _CELL, last_y) - y0
+            count = 1
+            while count > 0:
+                count = _do_cell(scratch, world, care, count - 1, x0, y0)
+
+
+@inlined
+def _do_cell(scratch: QuietScratch, world: World, care: Care, top: int, x0: int, y0: int) -> int:
+    """Fill the cell on top of the stack, or cut it. Returns the stack's new height."""
+    cells = scratch.cells
+    a, b, c, d = int(cells[top, 0]), int(cells[top, 1]), int(cells[top, 2]), int(cells[top, 3])
+    if _fill(scratch, world, care, a, b, c, d, x0, y0):
+        return top
+    m, n = (a + c) // 2, (b + d) // 2
+    for part in range(4):
+        left, upper = part % 2 == 0, part // 2 == 0
+        if (left and m == a and c > a) or (upper and n == b and d > b):
+            continue  # a cell one pixel wide has but one half
+        cells[top, 0], cells[top, 1] = (a if left else m), (b if upper else n)
+        cells[top, 2], cells[top, 3] = (m if left else c), (n if upper else d)
+        top += 1
+    return top
+
+
+@inlined
+def _fill(
+    scratch: QuietScratch, world: World, care: Care, a: int, b: int, c: int, d: int, x0: int, y0: int
+) -> bool:
+    """Fill a cell from column a to c and row b to d, if its corners agree and all in it is of one piece."""
+    small = c - a <= 1 and d - b <= 1
+    first = _place(a, b)
+    if not small:
+        if scratch.part[first] < 0:
+            return False
+        for j in range(b, d + 1):
+            for i in range(a, c + 1):
+                if not _alike(scratch, first, _place(i, j), _ALIKE):
+                    return False
+    low, high = math.inf, -math.inf
+    for k in range(4):
+        i, j = (c if k % 2 else a), (d if k // 2 else b)
+        if scratch.part[_place(i, j)] >= 0:
+            share = _node(scratch, world, care, i, j, x0, y0)
+            low, high = min(low, share), max(high, share)
+    if small:
+        return True
+    if high - low > care.step:
+        return False
+    wide, tall = max(1, c - a), max(1, d - b)
+    upper_left, upper_right = scratch.open[_place(a, b)], scratch.open[_place(c, b)]
+    lower_left, lower_right = scratch.open[_place(a, d)], scratch.open[_place(c, d)]
+    for j in range(b, d + 1):
+        t = (j - b) / tall
+        for i in range(a, c + 1):
+            s = (i - a) / wide
+            k = _place(i, j)
+            if scratch.rays[k] == 0:
+                above = upper_left + (upper_right - upper_left) * s
+                below = lower_left + (lower_right - lower_left) * s
+                scratch.open[k] = above + (below - above) * t
+    return True
+
+
+@inlined
+def _node(scratch: QuietScratch, world: World, care: Care, i: int, j: int, x0: int, y0: int) -> float:
+    """The share of the sky that a place sees, by as many rays as cells of its size can be large."""
+    k = _place(i, j)
+    if scratch.rays[k] != 0:
+        return scratch.open[k]
+    x, y = x0 + i, y0 + j
+    rays = care.rays
+    for level in range(_LEVELS):
+        if (x | y) & ((2 << level) - 1) == 0:
+            rays *= 2
+    packet, total = scratch.looking.packet, 0.0
+    for first in range(0, rays, LANES):
+        clear(packet)
+        for lane in range(min(LANES, rays - first)):
+            add_sky_ray(scratch.places, k, world.environment, packet, lane, _net_key(x, y, first + lane, rays))
+        visible(packet, world, OPAQUE, scratch.free)
+        for lane in range(min(LANES, rays - first)):
+            total += scratch.free[lane]
+    scratch.rays[k] = 1
+    scratch.open[k] = total / rays
+    return scratch.open[k]
+
+
+# --- what comes back ----------------------------------------------------------------------------------------------
+
+
+@inlined
+def _send(
+    scratch: QuietScratch, world: World, view: View, layer: OpaqueLayer, x0: int, y0: int, x1: int, y1: int
+) -> None:
+    """Let every place send back what arrives, and write the picture."""
+    looking = scratch.looking
+    block, packet = looking.block, looking.packet
+    for by in range(y0, y1, BLOCK_HEIGHT):
+        for bx in range(x0, x1, BLOCK_WIDTH):
+            for lane in range(LANES):
+                x, y = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
+                block.on[lane] = 0
+                block.distance[lane] = math.inf
+                set_key(block.key, lane, Key(x, y, 0, 0))
+                if x < x1 and y < y1 and scratch.part[_place(x - x0, y - y0)] >= 0:
+                    copy_lane(block, lane, scratch.places, _place(x - x0, y - y0))
+            send_back(block, looking.second, packet, world, OPAQUE)
+            write_opaque(layer, block, world, view, bx, by)
