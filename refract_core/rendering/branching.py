@@ -86,10 +86,14 @@ class Tree:
         corners = corners_of(view_of(self.camera, width, height))
         yield from self._quiet_passes(corners, 0.3)
         exposure = self.camera.exposure_scale * 2.0**settings.exposure
-        offsets, rays = np.array(pixel_offsets(settings.samples)), settings.light_samples
+        few, rays = max(2, settings.samples // 4), settings.light_samples
+        sets = [pixel_offsets(n) for n in (few, max(few, settings.samples // 2), settings.samples)]
         refining = by_address(
-            Refining(settings.tolerance, exposure, offsets, rays, max(1, rays // settings.samples))
-        )
+            Refining(
+                settings.tolerance, exposure, np.concatenate(sets), np.cumsum([0, *map(len, sets)]), settings.samples,
+                rays, max(1, rays // settings.samples),
+            )
+        )  # fmt: skip
         world, asking, samples_view = self.session.world, by_address(self._asking(corners)), by_address(view)
         opaque, target = by_address(self.opaque), by_address(self.planes)
 

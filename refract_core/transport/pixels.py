@@ -80,7 +80,7 @@ def _add_cell(planes: Planes, cell: Cell, opaque: OpaqueLayer, view: View, x0: i
         if x >= view.size[0] or y >= view.size[1]:
             continue
         if cell.glass[i] != 0:
-            add_light(planes, cell, i, x, y)
+            add_light(planes, cell, i, x, y, 1.0)
             add_glass(planes, cell, i, x, y, 1.0)
             if sample == 0:
                 keep_glass(planes, cell, i, x, y)
@@ -95,13 +95,13 @@ def _add_cell(planes: Planes, cell: Cell, opaque: OpaqueLayer, view: View, x0: i
 
 
 @inlined
-def add_light(planes: Planes, cell: Cell, i: int, x: int, y: int) -> None:
-    """Add what a view ray has seen to a pixel."""
+def add_light(planes: Planes, cell: Cell, i: int, x: int, y: int, times: float) -> None:
+    """Add what a view ray has seen to a pixel, `times` over."""
     for c in range(3):
-        planes.beauty[y, x, c] += cell.color[i, c]
-        planes.refraction[y, x, c] += cell.refraction[i, c]
-        planes.reflection[y, x, c] += cell.reflection[i, c]
-    planes.beauty[y, x, 3] += 1.0 - cell.missing[i]
+        planes.beauty[y, x, c] += times * cell.color[i, c]
+        planes.refraction[y, x, c] += times * cell.refraction[i, c]
+        planes.reflection[y, x, c] += times * cell.reflection[i, c]
+    planes.beauty[y, x, 3] += times * (1.0 - cell.missing[i])
 
 
 @inlined

@@ -93,7 +93,7 @@ class Care(NamedTuple):
     """How much is asked."""
 
     rays: int
-    """to a lamp from a place in a penumbra, and to the sky from a node; nodes of large cells send up to 16 times more"""
+    """to a lamp from a place in a penumbra, and to the sky from a node; nodes of large cells send more"""
     step: float
     """share of the sky by which the corners of a cell may differ"""
 
