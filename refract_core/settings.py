@@ -12,13 +12,13 @@ from .models import MODELS as MODELS
 TIERS = ("screen", "ray", "probe", "sky")
 SCREEN_METHODS = ("march", "proxy", "traced")
 QUALITIES: dict[str, dict[str, Any]] = {
-    "draft": {"samples": 1, "cut": 0.05},
-    "good": {"samples": 4, "cut": 0.02},
-    "best": {"samples": 16, "cut": 0.005, "tiers": ("probe", "ray", "sky")},
+    "draft": {"samples": 4, "tolerance": 0.1, "cut": 0.05, "light_samples": 16},
+    "good": {"samples": 16, "tolerance": 0.03, "cut": 0.02, "light_samples": 16},
+    "best": {"samples": 32, "tolerance": 0.015, "cut": 0.005, "light_samples": 64},
     "reference": {"samples": 256, "tolerance": 0.0, "cut": 0.0005, "tiers": ("ray", "sky"), "max_layers": 32},
 }
-"""What each level of quality stands for; each setting may also be chosen by its own name. The last two leave out what
-the picture lends its glass, and the last one also what probes do."""
+"""What each level of quality stands for; each setting may also be chosen by its own name. The last one draws all
+samples of every pixel, and leaves out what the picture lends its glass, and what probes do."""
 PRESETS: dict[str, dict[str, Any]] = {
     "hdrp": {"screen": "proxy", "tiers": ("screen", "probe", "sky"), "max_layers": 1},
 }
@@ -51,11 +51,11 @@ class RenderSettings:
     """[pixels]"""
     image_height: int = 0
     """[pixels]; 0 follows the camera's aspect."""
-    samples: int = 4
-    """Samples per pixel, 1 .. 4096; 1 stands in its middle."""
+    samples: int = 16
+    """Samples of a pixel, 1 .. 4096, where its corners differ; 1 stands in its middle, and corners are left alone."""
     tolerance: float = 0.03
-    """Where the corners of a pixel differ by no more, as the eye sees it, they are the pixel, 0 .. 1; others take all
-    samples. 0: every pixel does."""
+    """Difference of a pixel's corners, as the eye sees it, up to which they make the pixel, 0 .. 1. Beyond it is an edge
+    that takes samples, most where the difference is large. 0: every pixel takes all."""
     light_samples: int = 16
     """Rays to a light or to the sky where a pixel's corner sees a part of it, 1 .. 4096."""
     tiers: tuple[str, ...] = ("screen", "probe", "ray", "sky")
@@ -78,6 +78,12 @@ class RenderSettings:
     """Threads; 0 means all cores."""
     tile_size: int = 64
     """Pixels along a tile's side; rounded up to a multiple of 8. Never changes the picture."""
+
+    @property
+    def by_corners(self) -> bool:
+        """Pixels are made from their corners, and sampled where these differ. HDRP's proxies tell a pixel by its place,
+        so with them each sample is a picture of its own."""
+        return self.samples > 1 and self.tolerance > 0.0 and self.screen != "proxy"
 
     def __post_init__(self) -> None:
         _in_range("image_width", self.image_width, 1, MAX_PIXELS)

@@ -40,13 +40,18 @@ ImageWidth = Annotated[
     int | None, typer.Option("--image-width", "-w", help="Width in pixels. The default is 960.", show_default=False)
 ]
 ImageHeight = Annotated[int | None, typer.Option(help="Height in pixels. Without it the camera's aspect decides.")]
-Samples = Annotated[int | None, typer.Option(help="Samples per pixel, 1 to 4096. The default is 4.")]
+Samples = Annotated[
+    int | None,
+    typer.Option(
+        help="Samples of a pixel whose corners differ, 1 to 4096; 1 stands in its middle. The default is 16."
+    ),
+]
 Quality = Annotated[
     str | None,
     typer.Option(
         metavar="|".join(QUALITIES),
-        help="How much work goes into a picture: samples per pixel, how faint a branch of light is followed, and, from "
-        "best on, whether glass asks rays before the picture. The default is good; settings by name win over it.",
+        help="How much work goes into a picture: samples, tolerance, light samples and how faint a branch of light is "
+        "followed. The default is good; settings by name win over it.",
     ),
 ]
 Preset = Annotated[
@@ -59,6 +64,19 @@ Preset = Annotated[
 Cut = Annotated[
     float | None,
     typer.Option(help="Weight below which a branch of light is not followed for itself, 0 to 1. The default is 0.02."),
+]
+Tolerance = Annotated[
+    float | None,
+    typer.Option(
+        help="Difference of a pixel's corners, as the eye sees it, up to which they make the pixel, 0 to 1; beyond it "
+        "samples are drawn. 0 draws all samples of every pixel. The default is 0.03."
+    ),
+]
+LightSamples = Annotated[
+    int | None,
+    typer.Option(
+        help="Rays to a light or to the sky from a pixel's corner that sees a part of it, 1 to 4096. The default is 16."
+    ),
 ]
 Tiers = Annotated[
     str | None,
@@ -166,6 +184,8 @@ def render(
     quality: Quality = None,
     preset: Preset = None,
     samples: Samples = None,
+    tolerance: Tolerance = None,
+    light_samples: LightSamples = None,
     cut: Cut = None,
     tiers: Tiers = None,
     screen: Screen = None,
@@ -193,6 +213,8 @@ def render(
         "quality": quality,
         "preset": preset,
         "samples": samples,
+        "tolerance": tolerance,
+        "light_samples": light_samples,
         "cut": cut,
         "tiers": None if tiers is None else words(tiers),
         "screen": screen,

@@ -32,11 +32,6 @@ _SKY_STEP = 3.0
 """Of the tolerance: by how much the share of the sky may change over a cell."""
 
 
-def by_corners(settings: RenderSettings) -> bool:
-    """Pixels are made from their corners."""
-    return settings.samples > 1 and settings.tolerance > 0.0 and settings.screen != "proxy"
-
-
 class Tree:
     """An `Integrator`. Holds the buffers that pictures are drawn into; `planes` take the sums of all samples.
 
@@ -56,7 +51,7 @@ class Tree:
         model = int(BY_TOKEN[settings.model]) if settings.model else -1
         self.rules = by_address(Rules(model, settings.max_layers, settings.cut, settings.screen != "proxy"))
         self.view_ray = by_address(view_ray(scene, camera, settings.model))
-        self.by_corners = by_corners(settings)
+        self.by_corners = settings.by_corners
         self.size = (width, height)
         width, height = (width + 1, height + 1) if self.by_corners else (width, height)
         self.screen = new_screen_buffers(width, height, is_rough(scene))

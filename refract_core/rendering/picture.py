@@ -25,7 +25,7 @@ from ..transport.pixels import tree_tile
 from ..version import __version__
 from ..view.camera import image_size, view_of
 from ..view.planes import by_name, finish_of, finish_tile, new_planes
-from .branching import Tree, by_corners
+from .branching import Tree
 from .session import Session, choose_camera, prepare
 from .work import Cancel, Progress, Work, tiles_of, working
 
@@ -123,4 +123,4 @@ def _told(work: Work, done: float, share: float) -> Callable[[float], None]:
 
 def _first_offset(settings: RenderSettings) -> tuple[float, float]:
     """Where in their pixels the places stand that the picture's data are of."""
-    return (0.0, 0.0) if by_corners(settings) else pixel_offsets(settings.samples)[0]
+    return (0.0, 0.0) if settings.by_corners else pixel_offsets(settings.samples)[0]

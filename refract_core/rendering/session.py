@@ -56,7 +56,8 @@ def prepare(scene: Scene, camera: Camera, settings: RenderSettings, work: Work) 
     """Pack tables, build the BVH, capture probes."""
     proxies = "screen" in settings.tiers and settings.screen == "proxy"
     chosen = plan_picture(scene, camera, drawn="probe" in settings.tiers, proxies=proxies)
-    samples = min(settings.samples, _PROBE_SAMPLES)
+    # Where pixels are made from corners, most of them are seen four times, however many samples edges take.
+    samples = min(max(1, settings.samples // 4) if settings.by_corners else settings.samples, _PROBE_SAMPLES)
     return _prepare(scene, camera, chosen, is_rough(scene), samples, work, (0.1, 0.2))
 
 
