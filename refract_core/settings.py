@@ -54,8 +54,8 @@ class RenderSettings:
     samples: int = 16
     """Samples of a pixel, 1 .. 4096, where its corners differ; 1 stands in its middle, and corners are left alone."""
     tolerance: float = 0.03
-    """Difference of a pixel's corners, as the eye sees it, up to which they make the pixel, 0 .. 1. Beyond it is an edge
-    that takes samples, most where the difference is large. 0: every pixel takes all."""
+    """Difference of a pixel's corners, as the eye sees it, up to which they make the pixel, 0 .. 1. Beyond it is an
+    edge, which takes samples, most where the difference is large. 0: every pixel takes all."""
     light_samples: int = 16
     """Rays to a light or to the sky where a pixel's corner sees a part of it, 1 .. 4096."""
     tiers: tuple[str, ...] = ("screen", "probe", "ray", "sky")

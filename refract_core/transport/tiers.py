@@ -27,7 +27,7 @@ from ..view.pyramid import Screen
 from ..view.screen import light_seen, screen_blurred, screen_march, screen_proxy
 from ..world.embree import OPAQUE, SCATTERED, Packet, clear, set_ray
 from ..world.environment import prefiltered
-from ..world.shading import ONE_RAY, Block, load_hits, load_surface, shade
+from ..world.shading import ONE_RAY, Block, load_hits, load_surface, nth, shade
 from ..world.surface import NOTHING, HitLanes, Ray, interaction, kept_hit
 from ..world.tables import World
 from ..world.tracing import intersect_world
@@ -88,6 +88,12 @@ class Query(NamedTuple):
     """radiance"""
     albedo: Vectors
     irradiance: Vectors
+
+    # Sums over the rays of a cone.
+    gathered: Vectors
+    """radiance"""
+    scattered: Scalars
+    """share of them that met anything"""
 
 
 class Asking(NamedTuple):
@@ -230,7 +236,7 @@ def _ask_screen_traced(query: Query, lane: int, asking: Asking, work: TierScratc
     screen, surface = asking.screen, work.second
     d = row(query.direction, lane)
     at = interaction(world.geometry, hit, Ray(row(query.origin, lane), d), query.width[lane])
-    seen = light_seen(screen, at.point, flip_towards(at.ng, scale(d, -1.0)), asking.quiet)
+    seen = light_seen(screen, at.point, flip_towards(at.ng, scale(d, -1.0)), asking.quiet and sharp)
     if not seen.known:
         return
     if not sharp:
@@ -280,48 +286,76 @@ def _ask_probe(query: Query, lane: int, k: int, probes: ProbeTable, world: World
 
 
 @inlined
-def _ask_rays(query: Query, embedded: bool, work: TierScratch, world: World, times: int) -> None:
-    """Light of what every lane with weight left meets; `embedded` lanes only, or all. A cone sends a ray of its own."""
+def _ask_rays(
+    query: Query, embedded: bool, work: TierScratch, world: World, times: int
+) -> None:
+    """Light of what every lane with weight left meets; `embedded` lanes only, or all. A cone sends rays of its own, as
+    many as a strong leaf sends to a light."""
     packet, second = work.packet, work.second
-    clear(packet)
     some = scatters = strong = False
     for lane in range(LANES):
-        second.on[lane] = work.sent[lane] = 0
+        work.sent[lane] = 0
         if query.on[lane] == 0 or _headroom(query, lane) <= 1.0 - _SPENT:
             continue
         if embedded and query.embedded[lane] == 0:
             continue
         strong = strong or query.strong[lane] != 0
-        key = key_of(query.key, lane)
-        set_key(second.key, lane, key)
         if query.blur[lane] > 0.0:
             scatters = True
             work.sent[lane] = 1
-            u1, u2 = unit_pair(key, Purpose.ROUGH_LEAF.value)
-            d = _scatter(row(query.direction, lane), query.blur[lane], u1, u2)
-            work.far[lane] = math.inf
-            set_ray(packet, lane, row(query.origin, lane), d, 0.0, math.inf, OPAQUE)
         elif query.met.part[lane] != NOTHING:
             some = True
             work.sent[lane] = 2
-    if scatters:
-        intersect_world(packet, world, work.far, SCATTERED)
-        load_hits(second, packet, world, 0.0)
-        some = True
-    if not some:
+    rays = times if strong else ONE_RAY
+    if some:
+        _shade_met(query, work, world, rays)
+    if not scatters:
         return
     for lane in range(LANES):
+        query.scattered[lane] = 0.0
+        put(query.gathered, lane, (0.0, 0.0, 0.0))
+    for k in range(rays):
+        clear(packet)
+        for lane in range(LANES):
+            second.on[lane] = 0
+            if work.sent[lane] == 1:
+                key = nth(key_of(query.key, lane), k, rays)
+                set_key(second.key, lane, key)
+                u1, u2 = unit_pair(key, Purpose.ROUGH_LEAF.value)
+                d = _scatter(row(query.direction, lane), query.blur[lane], u1, u2)
+                work.far[lane] = math.inf
+                set_ray(packet, lane, row(query.origin, lane), d, 0.0, math.inf, OPAQUE)
+        intersect_world(packet, world, work.far, SCATTERED)
+        load_hits(second, packet, world, 0.0)
+        shade(second, work.third, packet, world, OPAQUE, ONE_RAY)
+        for lane in range(LANES):
+            if work.sent[lane] == 1 and second.on[lane] != 0:
+                query.scattered[lane] += 1.0 / rays
+                put(query.gathered, lane, add(row(query.gathered, lane), scale(row(second.color, lane), 1.0 / rays)))
+    for lane in range(LANES):
+        if work.sent[lane] == 1 and query.scattered[lane] > 0.0:  # what met nothing is left to the next tier
+            _add_covered(
+                query, lane, RAY, row(query.gathered, lane), query.scattered[lane], _headroom(query, lane), 1.0
+            )
+
+
+@inlined
+def _shade_met(query: Query, work: TierScratch, world: World, rays: int) -> None:
+    """Light of the lanes whose hit is known."""
+    second = work.second
+    for lane in range(LANES):
+        second.on[lane] = 0
         if work.sent[lane] == 2:
+            set_key(second.key, lane, key_of(query.key, lane))
             d = row(query.direction, lane)
             ray = Ray(row(query.origin, lane), d)
             at = interaction(world.geometry, kept_hit(query.met, lane), ray, query.width[lane])
             second.on[lane] = 1
             load_surface(second, lane, at, world, scale(d, -1.0))
-    shade(second, work.third, packet, world, OPAQUE, times if strong else ONE_RAY)
+    shade(second, work.third, work.packet, world, OPAQUE, rays)
     for lane in range(LANES):
         if second.on[lane] != 0:
-            if work.sent[lane] == 2:
-                _note_surface(query, lane, second, row(second.diffuse, lane))
+            _note_surface(query, lane, second, row(second.diffuse, lane))
             _add(query, lane, RAY, row(second.color, lane), _headroom(query, lane), 1.0)
 
 

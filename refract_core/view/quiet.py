@@ -19,7 +19,7 @@ import numpy as np
 
 from ..kernels.arrays import F64_1D, I32_1D, I32_2D
 from ..kernels.compile import inlined, kernel
-from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Flags, Scalars, new_lanes
+from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Scalars, new_lanes
 from ..kernels.sampling import Key, set_key
 from ..kernels.vec import dot, length, row, sub
 from ..world.embree import COHERENT, EVERYTHING, OPAQUE, clear, has_hit
@@ -33,6 +33,7 @@ from ..world.shading import (
     copy_lane,
     forget_light,
     load_hits,
+    nth,
     send_back,
 )
 from ..world.surface import hit_in
@@ -73,10 +74,10 @@ class QuietScratch(NamedTuple):
     """shape (N,): and that share"""
     cells: I32_2D
     """shape (64, 4): cells yet to be done: first and last column and row"""
-    which: Flags
-    """places of a packet's lanes"""
     free: Scalars
     """1 where nothing is in the way"""
+    weight: Scalars
+    """of the rays to the sky"""
 
     @staticmethod
     def fresh() -> QuietScratch:
@@ -85,7 +86,7 @@ class QuietScratch(NamedTuple):
         return QuietScratch(
             new_lanes(ViewScratch), new_lanes(Block, count), np.zeros(count, np.int32), np.zeros(count),
             np.zeros(count, np.int32), np.zeros(count), np.zeros((64, 4), np.int32),
-            np.zeros(LANES, np.int32), np.zeros(LANES),
+            np.zeros(LANES), np.zeros(LANES),
         )  # fmt: skip
 
 
@@ -186,10 +187,10 @@ def _alike(scratch: QuietScratch, i: int, j: int, cosine: float) -> bool:
 
 
 @inlined
-def _net_key(x: int, y: int, k: int, rays: int) -> Key:
-    """The key of ray `k` of `rays` that a place sends as one of a net of 4x4."""
+def _net_key(x: int, y: int) -> Key:
+    """The key of what a place sends as one of a net of 4x4."""
     turn = (x & 1) | (y & 1) << 1 | (x & 2) << 1 | (y & 2) << 2
-    return Key(x >> 2, y >> 2, _NET, turn * rays + k)
+    return Key(x >> 2, y >> 2, _NET, turn)
 
 
 # --- lamps --------------------------------------------------------------------------------------------------------
@@ -235,7 +236,7 @@ def _find(scratch: QuietScratch, world: World, l: int, x0: int, y0: int, x1: int
                     scratch.found[i] = 1.0
                     if shadows:
                         some = True
-                        add_light_ray(places, i, lights, l, packet, lane, _net_key(x, y, 0, 1))
+                        add_light_ray(places, i, lights, l, packet, lane, _net_key(x, y))
             if not some:
                 continue
             visible(packet, world, OPAQUE, scratch.free)
@@ -263,7 +264,7 @@ def _share_of_lamp(scratch: QuietScratch, world: World, rays: int, l: int, i: in
     for first in range(0, rays, LANES):
         clear(packet)
         for lane in range(min(LANES, rays - first)):
-            add_light_ray(scratch.places, i, world.lights, l, packet, lane, _net_key(x, y, first + lane, rays))
+            add_light_ray(scratch.places, i, world.lights, l, packet, lane, nth(_net_key(x, y), first + lane, rays))
         visible(packet, world, OPAQUE, scratch.free)
         for lane in range(min(LANES, rays - first)):
             total += scratch.free[lane]
@@ -359,16 +360,21 @@ def _node(scratch: QuietScratch, world: World, care: Care, i: int, j: int, x0: i
     for level in range(_LEVELS):
         if (x | y) & ((2 << level) - 1) == 0:
             rays *= 2
-    packet, total = scratch.looking.packet, 0.0
+    packet, places = scratch.looking.packet, scratch.places
+    seen = asked = 0.0
     for first in range(0, rays, LANES):
         clear(packet)
-        for lane in range(min(LANES, rays - first)):
-            add_sky_ray(scratch.places, k, world.environment, packet, lane, _net_key(x, y, first + lane, rays))
+        taken = min(LANES, rays - first)
+        for lane in range(taken):
+            scratch.weight[lane] = add_sky_ray(
+                places, k, world.environment, packet, lane, _net_key(x, y), first + lane, rays
+            )
         visible(packet, world, OPAQUE, scratch.free)
-        for lane in range(min(LANES, rays - first)):
-            total += scratch.free[lane]
+        for lane in range(taken):
+            seen += scratch.weight[lane] * scratch.free[lane]
+            asked += scratch.weight[lane]
     scratch.rays[k] = 1
-    scratch.open[k] = total / rays
+    scratch.open[k] = seen / asked if asked > 0.0 else 1.0
     return scratch.open[k]
 
 

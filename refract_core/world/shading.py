@@ -78,6 +78,10 @@ class Block(NamedTuple):
     """radiance towards wo of the lights' highlights"""
     sky_seen: Scalars
     """share of the sky's light that arrives, 0 .. 1"""
+    sky_asked: Scalars
+    """sum of the weights of the rays to the sky"""
+    sky_weight: Scalars
+    """and that of the last"""
     color: Vectors
     """the result: radiance towards wo"""
 
@@ -280,28 +284,58 @@ def _gather_sky(block: Block, packet: Packet, world: World, mask: int, times: in
     if not environment.present or environment.dark:
         return
     for lane in range(LANES):
-        block.sky_seen[lane] = 0.0 if block.on[lane] != 0 and block.matte[lane] != 0 else 1.0
+        block.sky_seen[lane] = block.sky_asked[lane] = 0.0
     for k in range(times):
         clear(packet)
         for lane in range(LANES):
             if block.on[lane] != 0 and block.matte[lane] != 0:
-                add_sky_ray(block, lane, environment, packet, lane, nth(key_of(block.key, lane), k, times))
+                block.sky_weight[lane] = add_sky_ray(
+                    block, lane, environment, packet, lane, key_of(block.key, lane), k, times
+                )
         visible(packet, world, mask, block.free)
         for lane in range(LANES):
             if block.on[lane] != 0 and block.matte[lane] != 0:
-                block.sky_seen[lane] += block.free[lane] / times
+                block.sky_seen[lane] += block.sky_weight[lane] * block.free[lane]
+                block.sky_asked[lane] += block.sky_weight[lane]
     for lane in range(LANES):
+        block.sky_seen[lane] = block.sky_seen[lane] / block.sky_asked[lane] if block.sky_asked[lane] > 0.0 else 1.0
         if block.on[lane] != 0 and block.matte[lane] != 0:
             add_sky(block, lane, environment)
 
 
 @inlined
 def add_sky_ray(
-    block: Block, i: int, environment: EnvironmentTable, packet: Packet, lane: int, key: Key
-) -> None:
-    """Put a ray from hit `i` to a place of the sky into a lane."""
-    direction = _sky_direction(environment, row(block.ns, i), key)
+    block: Block, i: int, environment: EnvironmentTable, packet: Packet, lane: int, key: Key, k: int, times: int
+) -> float:
+    """Put ray `k` of `times` from hit `i` to the sky into a lane. Returns for how much it counts among them."""
+    n = row(block.ns, i)
+    direction, weight = _sky_direction(environment, n, nth(key, k, times)), 1.0
+    if times > 1 and not environment.even:
+        direction, weight = _nth_sky_direction(environment, n, key, k, times)
     add_shadow_ray(packet, lane, row(block.point, i), row(block.ng, i), direction, math.inf)
+    return weight
+
+
+@inlined
+def _nth_sky_direction(environment: EnvironmentTable, n: Vec, key: Key, k: int, times: int) -> tuple[Vec, float]:
+    """One of many directions to the sky, and its weight: every other one by the cosine, the rest by the radiance.
+
+    Each half keeps the strata of its sequence; a weight is what comes from there over the density with which both
+    halves together draw it (Veach's balance heuristic).
+    """
+    half = times // 2
+    own = nth(key, k // 2, half if k % 2 else times - half)
+    if k % 2:
+        u1, u2 = unit_pair(own, Purpose.SKY_RADIANCE.value)
+        direction, radiance = sample_direction(environment, u1, u2)
+    else:
+        u1, u2 = unit_pair(own, Purpose.SKY_COSINE.value)
+        direction = _cosine_direction(n, u1, u2)
+        radiance = direction_pdf(environment, direction)
+    cosine = dot(direction, n)
+    if cosine <= 0.0:
+        return n, 0.0
+    return direction, cosine * radiance / ((times - half) * cosine / math.pi + half * radiance)
 
 
 @inlined
