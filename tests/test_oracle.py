@@ -47,7 +47,7 @@ def settings_of(seed: int) -> rc.RenderSettings:
     chosen["cut"] = (0.02, 0.002, 0.2)[seed % 3]
     chosen["screen"] = "proxy" if seed % 13 == 6 else "traced"
     chosen["exposure"] = 1.0 if seed % 17 == 8 else 0.0
-    chosen["model"] = {9: "box", 10: "traced", 11: "thin", 12: "sphere"}.get(seed % 19, "")
+    chosen["model"] = {9: "box", 10: "traced", 11: "thin", 12: "sphere", 13: "single"}.get(seed % 19, "")
     return rc.RenderSettings(image_width=WIDTH, image_height=HEIGHT, jobs=1, **chosen)
 
 
