@@ -324,6 +324,16 @@ FIGURES: Mapping[str, tuple[Panel, ...] | Callable[[Path], RGB]] = {
         mirror('uniform token probe:proxy = "volume"\nfloat3 probe:proxy:size = (6, 3, 6)'),
         mirror('uniform token probe:proxy = "volume"\nrel probe:proxy:prim = </World/Room>'),
     ),
+    "depth": (
+        room(
+            'uniform token probe:mode = "realtime"\nuniform token probe:proxy = "volume"\n'
+            "rel probe:proxy:prim = </World/Room>"
+        ),
+        room(
+            'uniform token probe:mode = "realtime"\nuniform token probe:proxy = "depth"', tiers=("probe", "ray", "sky")
+        ),
+        room(tiers=("ray", "sky")),
+    ),
     "proxy_radius": tuple(
         Panel(
             "ring.usda",

@@ -299,6 +299,8 @@ class Probe:
     """Radiance where nothing is met; None lets the sky through."""
     distance_roughness: bool = False
     """Under `--screen proxy`: lower the roughness of what is near (HDRP, LightEvaluation.hlsl)."""
+    marched: bool = False
+    """The distances in its own picture say where a ray ends, and the proxy serves the screen alone. For cubes."""
     captured: tuple[str, ...] | None = None
     """Paths of the prims it sees (the `captured` collection); None means everything."""
     blend_distance: tuple[float, ...] = (0.0,) * 6

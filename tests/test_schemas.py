@@ -61,7 +61,7 @@ TABLE = (
     Attribute(PROBE, "probe:influence:blendDistance", "float[]", ZEROS),
     Attribute(PROBE, "probe:influence:blendNormalDistance", "float[]", ZEROS),
     Attribute(PROBE, "probe:influence:faceFade", "float[]", ONES),
-    Attribute(PROBE, "probe:proxy", "token", "influence", ("influence", "volume", "infinite"), uniform=True),
+    Attribute(PROBE, "probe:proxy", "token", "influence", ("influence", "volume", "infinite", "depth"), uniform=True),
     Attribute(PROBE, "probe:proxy:size", "float3", (10, 10, 10), minimum=(0, 0, 0)),
     Attribute(PROBE, "probe:proxy:radius", "float", 3.0, minimum=0.0),
     Attribute(PROBE, "probe:importance", "int", 1, minimum=0, maximum=32767),

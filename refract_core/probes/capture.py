@@ -19,6 +19,7 @@ from ..world.embree import COHERENT, Packet, clear, set_ray
 from ..world.shading import Block, load_hits, shade
 from ..world.tables import World
 from ..world.tracing import intersect_world
+from .depth import fill_depths
 from .faces import (
     CUBE,
     TEXEL,
@@ -225,6 +226,8 @@ def _fill_levels(table: ProbeTable, drawn: list[int], entries: list[Entry], run:
             _average_window(table, k)
             return []
         fill_cube_border(_level(table, k, 0))
+        if table.depths.first[k] >= 0:
+            fill_depths(table.depths, k, view_of_level(table.texels, Levels(table.first[k], table.side[k]), 0, CUBE))
         cubemap = entries[k].probe.cubemap
         if table.last[k] == 0 or (cubemap is not None and len(cubemap.levels) > 1):
             return []
