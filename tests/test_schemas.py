@@ -67,6 +67,7 @@ TABLE = (
     Attribute(PROBE, "probe:importance", "int", 1, minimum=0, maximum=32767),
     Attribute(PROBE, "probe:weight", "float", 1.0, minimum=0.0, maximum=1.0),
     Attribute(PROBE, "probe:multiplier", "float", 1.0, minimum=0.0),
+    Attribute(PROBE, "probe:captureRefraction", "bool", False, uniform=True),
     Attribute(PROBE, "probe:distanceBasedRoughness", "bool", False, uniform=True),
     Attribute(PROBE, "probe:fadeDistance", "float", 10000.0, minimum=0.0),
     Attribute(PROBE, "collection:captured:includeRoot", "bool", True, uniform=True),

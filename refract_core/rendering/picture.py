@@ -6,6 +6,7 @@ stage -> Scene -> tables and BVH -> probes -> per sample: the integrator's passe
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import replace
 
@@ -17,15 +18,20 @@ from ..kernels.compile import is_compiled
 from ..kernels.lanes import by_address
 from ..kernels.sampling import pixel_offsets
 from ..models import BY_TOKEN, SHEET, Behind
+from ..probes.capture import Over, face_camera, paste_face
+from ..probes.lookup import empty_table
+from ..probes.plan import seen_things
 from ..progress import COMPILING
-from ..scene import Camera, Notice, Scene
+from ..scene import F32, Camera, Notice, Probe, Scene
 from ..settings import RenderSettings
 from ..transport.tree import tree_tile
 from ..version import __version__
 from ..view.camera import image_size, view_of
 from ..view.planes import by_name, finish_of, finish_tile, new_planes
+from ..world.embree import Bvh
+from ..world.tables import World, prim_of
 from .branching import Tree
-from .session import Session, choose_camera, prepare
+from .session import PROBE_SAMPLES, Session, choose_camera, prepare, prepare_bare
 from .work import Cancel, Progress, Work, tiles_of, working
 
 
@@ -63,7 +69,7 @@ def render(
     with working(executor, settings.jobs, progress, cancel) as work:
         if not is_compiled(tree_tile):
             work.progress(0.0, COMPILING)
-        session = prepare(scene, camera, settings, work)
+        session = prepare(scene, camera, settings, work, glass_over(scene, camera, settings, work))
         planes, rays = _draw(session, scene, camera, settings, (width, height), work)
         work.progress(1.0, "done")
     metadata: dict[str, str | float] = {
@@ -77,7 +83,8 @@ def render(
         "refract:metersPerUnit": scene.metres_per_unit,
         "refract:rays": float(rays + session.rays),
     }
-    notices = scene.notices + camera_light(scene) + open_meshes(scene, settings.model) + session.notices
+    notices = scene.notices + camera_light(scene) + open_meshes(scene, settings.model) + glass_twice(scene, settings)
+    notices += session.notices
     return Frame(width, height, planes, metadata, notices)
 
 
@@ -99,6 +106,15 @@ def open_meshes(scene: Scene, model: str) -> tuple[Notice, ...]:
     return tuple(found)
 
 
+def glass_twice(scene: Scene, settings: RenderSettings) -> tuple[Notice, ...]:
+    """Say which probes see glass that rays meet by themselves."""
+    if "probe" not in settings.tiers or settings.max_layers == 1:
+        return ()
+    text = "it sees glass (probe:captureRefraction), and rays meet that glass as well, so it may show twice"
+    seeing = [probe.path for probe in scene.probes if probe.sees_glass]
+    return tuple(Notice(path, f"{text}. Use --max-layers 1, or switch the attribute off") for path in seeing)
+
+
 def _draw(
     session: Session, scene: Scene, camera: Camera, settings: RenderSettings, size: tuple[int, int], work: Work
 ) -> tuple[dict[str, NDArray[np.float32]], int]:
@@ -117,3 +133,50 @@ def _draw(
     first, target = by_address(view_of(camera, *size, offsets[0])), by_address(planes)
     work.run(lambda tile: finish_tile(target, first, finish, tile), tiles)
     return by_name(planes), rays
+
+
+# --- what probes see of glass ---------------------------------------------------------------------------------------
+
+
+def glass_over(
+    scene: Scene, camera: Camera, settings: RenderSettings, work: Work
+) -> Callable[[World, Bvh], Over]:
+    """What draws the glass that a probe sees into its picture: each face of the cube is a picture of its own, of which
+    those texels are taken that show glass. Probes do not see one another's pictures: rays answer, and the sky.
+
+    Args:
+        camera: of the picture; where a stage has no light it shines.
+    """
+    quiet = work._replace(progress=lambda _share, _stage: None)
+    samples = min(settings.samples, PROBE_SAMPLES)
+
+    def of_world(world: World, bvh: Bvh) -> Over:
+        def over(probe: Probe, texels: F32) -> int:
+            tiers = ("ray",) if probe.background else ("ray", "sky")
+            asked = replace(settings, samples=samples, tiers=tiers, screen="traced", exposure=0.0)
+            if probe.captured is None:
+                nobody = np.full(len(scene.meshes) + len(scene.spheres), -1, np.int32)
+                session, seen = Session(world, bvh, empty_table([], [], camera, False), nobody, 0, ()), scene
+            else:
+                seen = _part_of(scene, seen_things(scene, probe))
+                session = prepare_bare(seen, camera, quiet)
+            side, rays = texels.shape[1], 0
+            for face in range(len(texels)):
+                planes, traced = _draw(session, seen, face_camera(probe, face), asked, (side, side), quiet)
+                depth = planes["Z"] * scene.metres_per_unit
+                paste_face(texels[face], planes["mask"] > 0.0, planes["beauty"], depth, probe.background)
+                rays += traced
+            return rays
+
+        return over
+
+    return of_world
+
+
+def _part_of(scene: Scene, prims: frozenset[str]) -> Scene:
+    """The scene with these prims alone."""
+    return replace(
+        scene,
+        meshes=tuple(mesh for mesh in scene.meshes if prim_of(mesh.path) in prims),
+        spheres=tuple(ball for ball in scene.spheres if prim_of(ball.path) in prims),
+    )

@@ -118,6 +118,7 @@ def _read_probe(source: ProbePrim, place: Place, frame: Frame) -> Probe:
         planar=planar,
         background=_background(source),
         distance_roughness=_distance_roughness(source, planar),
+        sees_glass=_sees_glass(source, mode, planar),
         captured=_captured(source),
         importance=int(number("importance", 32767)),
         weight=number("weight", 1.0),
@@ -198,6 +199,15 @@ def _distance_roughness(source: ProbePrim, planar: bool) -> bool:
     if wanted and planar:
         source.say("probe:distanceBasedRoughness is ignored: it is for cubemaps, not for planar probes. Remove it")
     return wanted and not planar
+
+
+def _sees_glass(source: ProbePrim, mode: str, planar: bool) -> bool:
+    wanted, name = flag(source, "probe:captureRefraction"), "probe:captureRefraction"
+    if wanted and planar:
+        source.say(f"{name} is ignored: it is for cubemaps, not for planar probes. Remove it")
+    elif wanted and mode != "realtime":
+        source.say(f"{name} is ignored: the mode is '{mode}', and only realtime probes see glass. Set probe:mode")
+    return wanted and not planar and mode == "realtime"
 
 
 def _captured(source: ProbePrim) -> tuple[str, ...] | None:
