@@ -218,23 +218,24 @@ def _cube_roughness(table: ProbeTable, k: int, ray: Cone, hdrp: bool, s: float, 
 
 @inlined
 def probe_light(
-    table: ProbeTable, k: int, ray: Cone, hdrp: bool, environment: EnvironmentTable, sky_follows: bool
+    table: ProbeTable, k: int, ray: Cone, hdrp: bool, environment: EnvironmentTable, sky_follows: bool, guesses: bool
 ) -> ProbeLight:
     """What probe `k` shows to a ray.
 
     Args:
         hdrp: roughness goes to levels by HDRP's mapping.
         sky_follows: a later tier will add the sky.
+        guesses: whether it is asked for what it does not know, which is then by its proxy, or for what it knows.
     """
     # A picture knows what lies in a direction from the place it was taken at, not from the ray's origin. Its own
     # distances say where the ray ends, or the proxy stands for the scene: there the picture is asked.
-    s = 0.0
-    if table.depths.first[k] >= 0:
+    marches, known, s = table.depths.first[k] >= 0, True, 0.0
+    if marches:
         met = meet_depths(table.depths, k, table.side[k, 0], row(table.capture, k), ray.origin, ray.direction)
-        if not met.known:
-            return ProbeLight((0.0, 0.0, 0.0), 1.0, 0.0, 0.0)
-        s = met.distance
-    else:
+        known, s = met.known, met.distance
+    if known == guesses:
+        return ProbeLight((0.0, 0.0, 0.0), 1.0, 0.0, 0.0)
+    if guesses or not marches:
         s = proxy_distance(table, k, ray.origin, ray.direction)
     meets = along(ray.origin, ray.direction, s)
     if table.planar[k] != 0:
@@ -259,7 +260,7 @@ def probe_light(
         r, g, b, coverage, distance = cube_at(table, k, sky, probe_lod_hdrp(gloss))
     # The picture tells how far away the thing in it was; the nearer that is to the proxy, the better the guess.
     confidence = 0.0
-    if distance > 0.0 and far > 0.0:
+    if distance > 0.0 and far > 0.0 and not guesses:
         confidence = min(distance, far) / max(distance, far)
     # Where the picture is open the sky shows; without a sky nobody knows what is there, and the share is left open.
     if coverage < 1.0 and environment.present and not sky_follows:
