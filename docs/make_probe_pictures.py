@@ -56,6 +56,7 @@ class Panel(NamedTuple):
     time_code: float | None = None
     screen: str = "traced"
     samples: int = 16
+    max_layers: int = 16
 
 
 # ------------------------------------------------------------------------------------------------ stages with edits
@@ -114,8 +115,9 @@ def load(panel: Panel, folder: Path) -> rc.Scene:
 def drawn(panel: Panel, folder: Path) -> RGB:
     """Render a panel as it is shown."""
     settings = rc.RenderSettings(
-        image_width=WIDTH, image_height=HEIGHT, samples=panel.samples, tiers=panel.tiers, screen=panel.screen
-    )
+        image_width=WIDTH, image_height=HEIGHT, samples=panel.samples, tiers=panel.tiers, screen=panel.screen,
+        max_layers=panel.max_layers,
+    )  # fmt: skip
     frame = rc.render(load(panel, folder), settings)
     beauty = display("beauty", frame.planes["beauty"])[..., :3].astype(np.float32) / 255.0
     if panel.show == "beauty":
@@ -247,6 +249,20 @@ def mirror(text: str, **choices: Any) -> Panel:
     return Panel("room.usda", edits, camera="Low", **choices)
 
 
+def glass_box(wanted: str) -> Panel:
+    """The box made of green glass, and whether the probe sees that."""
+    stuff = (
+        'uniform token refraction:model = "traced"\ncolor3f inputs:refraction:transmittanceColor = (0.3, 0.8, 0.5)\n'
+        'float inputs:refraction:absorptionDistance = 0.5\nover "Surface"\n{\nfloat inputs:roughness = 0\n}'
+    )
+    see = (
+        f'uniform token probe:mode = "realtime"\nuniform bool probe:captureRefraction = {wanted}\n'
+        "uniform int probe:resolution = 512\nrel collection:captured:excludes = [</World/Ball>]"
+    )
+    box = over("Box", "rel material:binding = </World/Looks/Pane>") + over("Looks/Pane", stuff)
+    return Panel("room.usda", probe(see) + box, max_layers=1)
+
+
 def pane(*tiers: str, roughness: float = 0.35, samples: int = 16, more: Edits = ()) -> Panel:
     rough = over("Looks/Pane/Surface", f"float inputs:roughness = {roughness}")
     edits = probe("uniform int probe:resolution = 512") + shown("Pane") + hidden("Ball") + rough + more
@@ -299,6 +315,11 @@ FIGURES: Mapping[str, tuple[Panel, ...] | Callable[[Path], RGB]] = {
             "rel collection:captured:includes = [</World/Cone>, </World/Box>]"
         ),
     ),
+    "capture_refraction": (
+        glass_box("0"),
+        glass_box("1"),
+        glass_box("0")._replace(tiers=("ray", "sky"), max_layers=16),
+    ),
     "shape": (
         field("float3 probe:influence:size = (6, 3, 3.2)"),
         field("float3 probe:influence:size = (3, 3, 4.4)"),
@@ -323,6 +344,16 @@ FIGURES: Mapping[str, tuple[Panel, ...] | Callable[[Path], RGB]] = {
         mirror('uniform token probe:proxy = "influence"\nfloat3 probe:influence:size = (4.6, 3, 4.6)'),
         mirror('uniform token probe:proxy = "volume"\nfloat3 probe:proxy:size = (6, 3, 6)'),
         mirror('uniform token probe:proxy = "volume"\nrel probe:proxy:prim = </World/Room>'),
+    ),
+    "depth": (
+        room(
+            'uniform token probe:mode = "realtime"\nuniform token probe:proxy = "volume"\n'
+            "rel probe:proxy:prim = </World/Room>"
+        ),
+        room(
+            'uniform token probe:mode = "realtime"\nuniform token probe:proxy = "depth"', tiers=("probe", "ray", "sky")
+        ),
+        room(tiers=("ray", "sky")),
     ),
     "proxy_radius": tuple(
         Panel(

@@ -22,6 +22,7 @@ class Behind(Enum):
     SLAB = "a second face parallel to the surface, one thickness away"
     SHEET = "a wall so thin that it has no inside: light enters it on either side, and passes"
     MESH = "the mesh itself, followed to its far side"
+    SCENE = "the scene: light turns at the surface, once, and there is no far side to leave by"
 
 
 class Row(NamedTuple):
@@ -51,6 +52,8 @@ class Model(IntEnum):
         fixed_thickness=0.005,
     )
     TRACED = 4, Row("the real mesh, to the real exit", Behind.MESH, needs_closed=True)
+    # Arm, "Refraction based on local cubemaps"
+    SINGLE = 5, Row("one interface: refracted at the surface, straight into the scene, without an exit", Behind.SCENE)
 
     row: Row
 
@@ -77,7 +80,7 @@ class Model(IntEnum):
     @property
     def sized(self) -> bool:
         """It needs to be told a thickness."""
-        return self.behind not in (Behind.NOTHING, Behind.MESH) and not self.fixed_thickness
+        return self.behind in (Behind.BALL, Behind.SLAB)
 
 
 BY_TOKEN: dict[str, Model] = {model.token: model for model in Model}

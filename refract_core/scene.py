@@ -299,8 +299,12 @@ class Probe:
     """Radiance where nothing is met; None lets the sky through."""
     distance_roughness: bool = False
     """Under `--screen proxy`: lower the roughness of what is near (HDRP, LightEvaluation.hlsl)."""
+    marched: bool = False
+    """The distances in its own picture say where a ray ends, and the proxy serves the screen alone. For cubes."""
     captured: tuple[str, ...] | None = None
     """Paths of the prims it sees (the `captured` collection); None means everything."""
+    sees_glass: bool = False
+    """Glass that it sees is drawn as in a picture. For realtime cubes; what `captured` leaves out is not there."""
     blend_distance: tuple[float, ...] = (0.0,) * 6
     """+x -x +y -y +z -z [m]"""
     blend_normal_distance: tuple[float, ...] = (0.0,) * 6

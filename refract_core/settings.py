@@ -21,6 +21,7 @@ QUALITIES: dict[str, dict[str, Any]] = {
 samples of every pixel, and leaves out what the picture lends its glass, and what probes do."""
 PRESETS: dict[str, dict[str, Any]] = {
     "hdrp": {"screen": "proxy", "tiers": ("screen", "probe", "sky"), "max_layers": 1},
+    "arm": {"model": "single", "tiers": ("probe", "sky"), "max_layers": 1},
 }
 """Settings that make other renderers' pictures."""
 PURPOSES = ("default", "render", "proxy", "guide")

@@ -52,7 +52,7 @@ class Render(StageOnly):
     image_width: Annotated[int, Field(ge=1, le=1 << 28)] | None = None
     image_height: Annotated[int, Field(ge=0, le=1 << 28, description="0 follows the camera's aspect")] | None = None
     quality: Literal["draft", "good", "best", "reference"] | None = None
-    preset: Literal["hdrp"] | None = None
+    preset: Literal["hdrp", "arm"] | None = None
     samples: Annotated[int, Field(ge=1, le=4096)] | None = None
     tolerance: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
     light_samples: Annotated[int, Field(ge=1, le=4096)] | None = None

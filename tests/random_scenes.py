@@ -360,7 +360,7 @@ def random_scene(seed: int, standing: bool = True) -> Scene:
     for z in (dice.number(-0.4, 0.1), dice.number(0.3, 0.8)):
         kind = dice.pick(["one", "one", "nested", "overlapping"])
         if kind == "one":
-            made.thing(_glass(dice, dice.pick([Model.TRACED, Model.TRACED, Model.SPHERE, Model.BOX, Model.THIN])), z)
+            made.thing(_glass(dice, dice.pick([Model.TRACED, Model.SINGLE, Model.SPHERE, Model.BOX, Model.THIN])), z)
         else:
             made.nested(z) if kind == "nested" else made.overlapping(z)
     if dice.chance(0.6):

@@ -21,12 +21,12 @@ def _mirrored(walls: int) -> float:
     return walls * F0 / (1.0 + (walls - 1) * F0)
 
 
-@pytest.mark.parametrize("model", [Model.SPHERE, Model.BOX, Model.THIN, Model.TRACED])
+@pytest.mark.parametrize("model", [Model.SPHERE, Model.BOX, Model.THIN, Model.TRACED, Model.SINGLE])
 def test_glass_alone_is_not_a_black_blob(model: Model) -> None:
     """A product without a stage around it: nobody knows what is behind, so the picture is left open there. A probe at
     its centre, which saw nothing, would answer black with full weight."""
     planes = draw(scene([], [glass(model)], [BALL]), 33, 33, tiers=TIERS, cut=1e-7)
-    walls = 1 if model in (Model.SPHERE, Model.BOX) else 2  # what is traced or thin mirrors on its far side, too
+    walls = 2 if model in (Model.THIN, Model.TRACED) else 1  # these mirror on their far side, too
     np.testing.assert_allclose(planes["weight.none"][16, 16], 1.0, atol=1e-6)
     np.testing.assert_allclose(planes["beauty"][16, 16, 3], _mirrored(walls), atol=1e-3)
     assert planes["beauty"][16, 16, :3].max() == 0.0

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from refract_core.errors import UsageError
 from refract_core.optics import arrays as optics
 from refract_core.optics import interface as scalar
+from refract_core.optics.models import single_model
 
 F64 = NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])
@@ -245,6 +246,16 @@ MODELS = np.array(
         [2.41, 60, 0.93320, -0.33534, -0.87087, 0.30702, -0.95170, 77.880, 1.07158, -0.38507],
     ]
 )
+
+
+@pytest.mark.parametrize("row", MODELS)
+def test_one_interface_turns_light_as_the_sphere_does_on_its_way_in(row: F64) -> None:
+    """By the fact sheet's table: from the entry at 0 the ball's light comes to P1, and one interface sends it there."""
+    ior, angle, path, x, z = row[:5]
+    wo = (math.sin(math.radians(angle)), 0.0, math.cos(math.radians(angle)))
+    length, leave, out = single_model((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), wo, ior, 1.0)
+    assert (length, leave) == (0.0, (0.0, 0.0, 0.0))
+    assert np.array(out) * path == pytest.approx([x, 0.0, z], abs=2e-5)
 
 
 def test_model_vectors_of_the_fact_sheet() -> None:

@@ -47,7 +47,7 @@ def settings_of(seed: int) -> rc.RenderSettings:
     chosen["cut"] = (0.02, 0.002, 0.2)[seed % 3]
     chosen["screen"] = "proxy" if seed % 13 == 6 else "traced"
     chosen["exposure"] = 1.0 if seed % 17 == 8 else 0.0
-    chosen["model"] = {9: "box", 10: "traced", 11: "thin", 12: "sphere"}.get(seed % 19, "")
+    chosen["model"] = {9: "box", 10: "traced", 11: "thin", 12: "sphere", 13: "single"}.get(seed % 19, "")
     return rc.RenderSettings(image_width=WIDTH, image_height=HEIGHT, jobs=1, **chosen)
 
 
@@ -152,7 +152,7 @@ def test_the_scenes_hold_something_of_everything() -> None:
     scenes = [scene_of(seed) for seed in range(SCENES)]
     materials = [m for s in scenes for m in s.materials]
     sources = [source for m in materials for source in m.inputs]
-    assert {m.model.name for m in materials} == {"NONE", "SPHERE", "BOX", "THIN", "TRACED"}
+    assert {m.model for m in materials} == set(Model)
     assert {m.specular_workflow for m in materials} == {True, False}
     assert any(m.abbe > 0 for m in materials)
     assert any(m.cutout and m.refractive for m in materials)

@@ -23,6 +23,7 @@ from scenes import (
     position_room,
     quad,
     scene,
+    snell,
     surrounding,
     turned,
     view_rays,
@@ -31,10 +32,11 @@ from scenes import (
 )
 
 from refract_core.scene import LightKind, Material, Mesh, Model, Probe, Scene, Sphere, Volume
+from refract_core.settings import named_settings
 
 F32 = NDArray[np.float32]
 
-MODELS = [Model.SPHERE, Model.BOX, Model.THIN, Model.TRACED]
+MODELS = [Model.SPHERE, Model.BOX, Model.THIN, Model.TRACED, Model.SINGLE]
 BALL = Sphere("/ball", (0.1, -0.1, 0.2), 0.8, 1)
 CUBE = box("/cube", (0.6, 0.5, 0.4), 1, turned((1, 2, 3), 40))
 DIRECT = 1.0
@@ -220,6 +222,67 @@ def test_a_slab_shifts_and_does_not_turn(model: Model) -> None:
     straight = wall_hit(origin, d)
     assert np.abs(straight - wall_hit(leave, d)).max() > 0.1  # the shift is there to be seen
     assert shift.min() > 0.05
+
+
+def test_one_interface_sends_light_from_its_own_point() -> None:
+    """Snell once, then straight to the wall, whatever the body is like behind the surface (Arm): its far side, which
+    is there to be met, does nothing."""
+    ior = 1.5
+    lens = camera((1.2, 0.4, 2.2), (0, 0, 0), fov=0.2)
+    what = in_positions(glass(Model.SINGLE, ior), box("/slab", (2, 2, 0.25), 1), cameras=(lens,))
+    picture = draw(what, 48, 48, cut=DIRECT)
+    origin, d = view_rays(lens, 48, 48)
+    entry = origin + d * ((0.25 - origin[..., 2:]) / d[..., 2:])
+    inside = d / ior  # Snell: what lies along the face is divided by n; the rest follows from the length, 1
+    inside[..., 2] = -np.sqrt(1 - inside[..., 0] ** 2 - inside[..., 1] ** 2)
+    np.testing.assert_allclose(where(picture["refraction"]), wall_hit(entry, inside), atol=2e-4)
+    assert (picture["path_length"] == 0.0).all()
+    assert (picture["layers"] == 1).all()
+
+
+@pytest.mark.parametrize("depth", [0.3, 1.0])
+def test_a_pool_seen_through_one_interface_is_the_traced_pool(depth: float) -> None:
+    """Light that ends on the ground before it could leave meets one interface, whatever the model: water over a floor
+    is where Arm's model is exact. Straight down the ground is at 1 / n of its depth (Hecht, Optics, 5.2)."""
+    ior = 4 / 3
+    water = box("/water", (ROOM + 0.5, depth / 2 + 0.25, ROOM + 0.5), 1, centre=(0, -ROOM + depth / 2 - 0.25, 0))
+    for lens in (camera((0.5, 1.0, 2.0), (0, -ROOM, 0), fov=0.3), camera((0, 2, 0), (0, -ROOM, 0), fov=0.02)):
+        one, real = (
+            draw(in_positions(glass(model, ior), water, cameras=(lens,)), 32, 32, tiers=("ray",), cut=DIRECT)
+            for model in (Model.SINGLE, Model.TRACED)
+        )
+        np.testing.assert_allclose(one["beauty"], real["beauty"], atol=1e-5)
+        np.testing.assert_allclose(where(one["refraction"])[..., 1], -ROOM, atol=1e-4)
+    place = where(one["refraction"])[..., 0]
+    apart = 2 * 0.02 / 32 * (2 + ROOM - depth + depth / ior)  # of pixels, at the depth that seems to be
+    np.testing.assert_allclose(np.abs(np.diff(place, axis=1)), apart, rtol=1e-3)
+
+
+def test_arms_preset_is_one_interface_and_a_corrected_cubemap() -> None:
+    """A ball in a room with a probe whose proxy is the room, against the closed form: from the ball's surface along the
+    refracted ray to the wall. What stands behind the ball, of glass too, is not there, and the ball absorbs nothing."""
+    preset = named_settings(preset="arm")
+    assert preset == {"model": "single", "tiers": ("probe", "sky"), "max_layers": 1}
+    walls, materials = position_room()
+    stuff = glass(Model.TRACED, 1.5, TRANSMITTANCE=0.2, absorption_distance=0.1)
+    other = box("/behind", (0.5, 0.5, 0.2), 1, centre=(0, 0, -1.5))
+    ball = Sphere("/ball", (0.3, -0.2, 0.4), 0.8, 1)
+    what = scene([*walls, other], [*materials, stuff], [ball], probes=(surrounding(),))
+    picture = draw(what, 96, 96, cut=DIRECT, **preset)
+    origin, d = view_rays(camera(), 96, 96)
+    to = np.array(ball.centre) - origin
+    along = (to * d).sum(-1)
+    inside = ball.radius**2 - (to**2).sum(-1) + along**2
+    point = origin + d * (along - np.sqrt(np.maximum(inside, 0)))[..., None]
+    n = (point - ball.centre) / ball.radius
+    cos_i = -(d * n).sum(-1)
+    here = (inside > 0) & (cos_i > 0.2)
+    assert here.mean() > 0.2
+    assert (picture["weight.probe"][here] > 1 - 1e-5).all()
+    out = [snell(ray, up, 1 / 1.5) for ray, up in zip(d[here], n[here], strict=True)]
+    error = np.linalg.norm(where(picture["refraction"][here]) - wall_hit(point[here], np.array(out)), axis=-1)
+    assert error.max() < 2 * ROOM / 64  # a texel of the probe, where two faces of it meet
+    assert np.median(error) < 1e-3
 
 
 def test_the_sphere_model_is_the_traced_exit_of_a_sphere() -> None:

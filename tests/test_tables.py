@@ -57,6 +57,7 @@ def test_numbers_are_places_in_the_table_and_tokens_lead_back() -> None:
 @pytest.mark.parametrize("model", Model)
 def test_every_model_has_a_function_or_follows_the_mesh(model: Model) -> None:
     assert (model in models.EXITS) is (model.behind not in (Behind.NOTHING, Behind.MESH))
+    assert model.sized is (model.behind in (Behind.BALL, Behind.SLAB))
     assert models.is_walked(int(model)) is (model.behind is Behind.MESH)
     assert models.is_sheet(int(model)) is (model.behind is Behind.SHEET)
 
@@ -64,6 +65,13 @@ def test_every_model_has_a_function_or_follows_the_mesh(model: Model) -> None:
 @pytest.mark.parametrize("model", models.EXITS)
 def test_a_kernel_leaves_a_model_as_its_own_function_does(model: Model) -> None:
     assert models.exit_of(int(model), P, N, WO, 1.5, 0.3) == models.EXITS[model](P, N, WO, 1.5, 0.3)
+
+
+def test_a_single_interface_refracts_and_leaves_where_it_is() -> None:
+    """R = refract(D, N, n1 / n2) at the surface point (Arm). Sine 0.6 in front, 0.4 behind it."""
+    length, leave, out = models.exit_of(int(Model.SINGLE), P, N, WO, 1.5, 0.3)
+    assert (length, leave) == (0.0, P)
+    assert out == pytest.approx((-0.4, 0.0, -math.sqrt(1 - 0.4**2)), abs=1e-15)
 
 
 def test_without_a_model_light_goes_straight_on() -> None:

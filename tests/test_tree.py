@@ -38,7 +38,7 @@ F32 = NDArray[np.float32]
 DIRECT, WHOLE = 1.0, 1e-7
 """Cuts: all light goes the way of what goes through; every branch is followed that can be seen in float32."""
 STRAIGHT = camera(fov=0.01, orthographic=True)
-MODELS = [Model.SPHERE, Model.BOX, Model.THIN, Model.TRACED]
+MODELS = [Model.SPHERE, Model.BOX, Model.THIN, Model.TRACED, Model.SINGLE]
 
 
 # --- Stacks, straight through, by the adding method -------------------------------------------------------------------

@@ -280,6 +280,17 @@ def test_distance_based_roughness() -> None:
     assert notices == []
 
 
+@pytest.mark.parametrize(("mode", "kind", "sees"), [
+    ("realtime", "RefractProbe", True), ("baked", "RefractProbe", False), ("custom", "RefractProbe", False),
+    ("realtime", "RefractPlanarProbe", False),
+])  # fmt: skip
+def test_only_realtime_cubes_see_glass(mode: str, kind: str, sees: bool) -> None:
+    body = f'uniform bool probe:captureRefraction = 1\nuniform token probe:mode = "{mode}"'
+    found, notices = read_only(probe(body + ("\n" + SKY if mode == "custom" else ""), kind=kind))
+    assert found.sees_glass == sees
+    assert ["probe:captureRefraction is ignored" in text for text in notices] == [True] * (not sees)
+
+
 # ---- how many
 
 
@@ -334,6 +345,7 @@ def test_unknown_token_is_an_error_that_lists_the_known_ones(name: str) -> None:
         ("float probe:weight = nan", "weight", 1),
         ("float probe:multiplier = -1", "multiplier", 0),
         ('uniform string probe:distanceBasedRoughness = "yes"', "distance_roughness", False),
+        ('uniform string probe:captureRefraction = "yes"', "sees_glass", False),
         ("int probe:importance = -3", "importance", 0),
         ("float[] probe:influence:blendDistance = [1]", "blend_distance", (0,) * 6),
         ("float[] probe:influence:blendDistance = [-1, 9, 1, 1, 1, 1]", "blend_distance", (0, 5, 1, 1, 1, 1)),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from probe_reading import Y_UP, Z_UP, planar, probe, read, read_one, read_only, to_engine
 
-from refract_core.scene import F64, Probe
+from refract_core.scene import F64, Cubemap, Probe
 
 # ---- the values
 
@@ -304,6 +304,36 @@ def test_captured_target_that_does_not_exist_is_told() -> None:
 
 def test_infinite_proxy() -> None:
     assert read_one('uniform token probe:proxy = "infinite"')[0].proxy is None
+
+
+def test_a_proxy_of_depth_marches_and_lends_its_influence_volume() -> None:
+    found, notices = read_one('uniform token probe:proxy = "depth"')
+    assert (found.marched, found.proxy, notices) == (True, found.influence, [])
+    assert not read_one()[0].marched
+
+
+def test_a_planar_probe_has_no_depth_to_march() -> None:
+    (found,), notices = read(planar('uniform token probe:proxy = "depth"'))
+    assert (found.marched, found.proxy) == (False, found.influence)
+    assert [(notice.path, "not for planar probes" in notice.text) for notice in notices] == [("/P", True)]
+
+
+GIVEN = 'uniform token probe:mode = "custom"\nasset probe:texture = @room.exr@\nuniform token probe:proxy = '
+
+
+@pytest.mark.parametrize(("proxy", "coverage", "distance", "told"), [
+    ("depth", 1.0, 0.0, True), ("depth", 1.0, 2.0, False), ("depth", 0.0, 0.0, False), ("influence", 1.0, 0.0, False),
+])  # fmt: skip
+def test_a_picture_without_distances_is_told_by_its_prim(
+    proxy: str, coverage: float, distance: float, told: bool
+) -> None:
+    """One that shows nothing but the sky has none to tell."""
+    texels = np.zeros((6, 8, 8, 5), np.float32)
+    texels[:, 2, 3, 3:] = coverage, distance
+    (found,), notices = read(probe(f'{GIVEN}"{proxy}"'), read_cubemap=lambda _path, _n: Cubemap((texels,)))
+    assert found.marched == (proxy == "depth" and not told)
+    assert [notice.path for notice in notices] == ["/P"] * told
+    assert all("no distances" in n.text and "refract bake probes" in n.text for n in notices)
 
 
 def test_own_proxy_has_the_probes_frame_and_its_own_size() -> None:

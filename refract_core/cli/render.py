@@ -58,7 +58,8 @@ Preset = Annotated[
     str | None,
     typer.Option(
         metavar="|".join(PRESETS),
-        help="hdrp draws what Unity's HDRP would: the screen by proxy, then probes and sky, and one layer of glass.",
+        help="hdrp draws what Unity's HDRP would: the screen by proxy, then probes and sky, and one layer of glass. "
+        "arm draws what Arm's local cubemaps would: one refraction at the surface, then probes and sky, one layer.",
     ),
 ]
 Cut = Annotated[

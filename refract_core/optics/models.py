@@ -70,10 +70,19 @@ def box_model(p: Vec, n: Vec, wo: Vec, ior: float, thickness: float) -> Exit:
     return path_length, along(p, inside, path_length), scale(wo, -1.0)
 
 
+@inlined
+def single_model(p: Vec, n: Vec, wo: Vec, ior: float, thickness: float) -> Exit:
+    """By Snell's law at the surface, and no further: out of the surface's own point, with no way inside (Arm,
+    Refraction based on local cubemaps: R = refract(D, N, n1 / n2))."""
+    _, inside, _, _, _ = _enter(n, wo, ior)
+    return 0.0, p, normalize(inside)
+
+
 EXITS: dict[Model, ExitFunction] = {
     Model.SPHERE: sphere_model,
     Model.BOX: box_model,
     Model.THIN: box_model,  # at the one thickness that its row fixes
+    Model.SINGLE: single_model,
 }
 """The function of every model that answers from the entry alone; `traced` is a walk (`transport.exits`)."""
 

@@ -14,11 +14,12 @@ from ..kernels.compile import inlined, kernel
 from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Scalars, by_address, scratch
 from ..kernels.sampling import Key, pixel_offsets, set_key
 from ..kernels.vec import along, length, normalize, row, scale, transform_direction, transform_point
-from ..scene import Cubemap
+from ..scene import Camera, Cubemap, Probe
 from ..world.embree import COHERENT, Packet, clear, set_ray
 from ..world.shading import ONE_RAY, Block, load_hits, shade
 from ..world.tables import World
 from ..world.tracing import intersect_world
+from .depth import fill_depths
 from .faces import (
     CUBE,
     TEXEL,
@@ -47,6 +48,11 @@ _BEFORE_WINDOW = 1e-4  # rays start this much before the window, so that what li
 
 Run = Callable[[Callable[[Any], Any], Sequence[Any]], list[Any]]
 """`run(function, items)` maps over items, side by side as it likes, and returns the results in their order."""
+
+
+Over = Callable[[Probe, NDArray[np.float32]], int]
+"""`over(probe, texels)` draws over a cube's picture, shape (6, n, n, TEXEL), what rays into the opaque scene do not
+show, and returns rays traced."""
 
 
 class CaptureScratch(NamedTuple):
@@ -163,12 +169,15 @@ def _keep_texels(table: ProbeTable, shot: Shot, face: int, block: Block, x0: int
         table.texels[i + 4] += block.distance[lane] * share
 
 
-def fill_table(table: ProbeTable, entries: list[Entry], world: World, run: Run, samples: int) -> int:
+def fill_table(
+    table: ProbeTable, entries: list[Entry], world: World, run: Run, samples: int, over: Over | None = None
+) -> int:
     """Draw every picture that no file brought, and make the levels of all.
 
     Args:
         world: by address.
         samples: rays per texel.
+        over: what draws glass for the probes that see it; None leaves it out.
 
     Returns:
         Rays traced.
@@ -191,6 +200,10 @@ def fill_table(table: ProbeTable, entries: list[Entry], world: World, run: Run, 
         return int(capture_rows(world, probes, shot, scratch(CaptureScratch), face, y0, y1))
 
     rays = sum(run(draw, tasks))
+    for k, entry in enumerate(entries):
+        if over and entry.drawn and entry.probe.sees_glass:
+            levels = Levels(table.first[k], table.side[k])
+            rays += over(entry.probe, view_of_level(table.texels, levels, 0, CUBE)[:, 1:-1, 1:-1])
     _fill_levels(table, [k for k, entry in enumerate(entries) if entry.drawn], entries, run)
     return rays
 
@@ -225,6 +238,8 @@ def _fill_levels(table: ProbeTable, drawn: list[int], entries: list[Entry], run:
             _average_window(table, k)
             return []
         fill_cube_border(_level(table, k, 0))
+        if table.depths.first[k] >= 0:
+            fill_depths(table.depths, k, view_of_level(table.texels, Levels(table.first[k], table.side[k]), 0, CUBE))
         cubemap = entries[k].probe.cubemap
         if table.last[k] == 0 or (cubemap is not None and len(cubemap.levels) > 1):
             return []
@@ -261,3 +276,41 @@ def cubemap_of(table: ProbeTable, k: int) -> Cubemap:
     levels = Levels(table.first[k], table.side[k])
     count = int(table.last[k]) + 1
     return Cubemap(tuple(view_of_level(table.texels, levels, m, CUBE)[:, 1:-1, 1:-1].copy() for m in range(count)))
+
+
+def face_camera(probe: Probe, face: int) -> Camera:
+    """Looks through one face of a cube; `paste_face` knows that its picture lies the other way round."""
+    # The faces of a cube are seen mirrored (`scene.Cubemap`), which no camera can be.
+    ahead = np.array(face_direction(face, 0.0, 0.0))
+    right, up = ahead - face_direction(face, 1.0, 0.0), face_direction(face, 0.0, -1.0) - ahead
+    frame = np.eye(4)
+    frame[:3, :3] = np.stack([right, up, -ahead], 1)
+    frame[:3, 3] = probe.capture_point
+    return Camera(probe.path, frame, (-1.0, 1.0, -1.0, 1.0), clipping=probe.clipping)
+
+
+def paste_face(
+    texels: NDArray[np.float32],
+    where: NDArray[np.bool_],
+    beauty: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    background: tuple[float, float, float] | None,
+) -> None:
+    """Put parts of the picture that a face's camera took over that face.
+
+    Args:
+        texels: shape (n, n, TEXEL): written to.
+        where: shape (n, n): the pixels that are taken.
+        beauty: shape (n, n, 4): radiance and alpha.
+        depth: shape (n, n): z_depth of what the texel shall be said to show [m]; inf for nothing.
+        background: of the probe; None leaves open what is open.
+    """
+    n = len(texels)
+    where, beauty, depth = where[:, ::-1], beauty[:, ::-1], depth[:, ::-1]
+    cover = np.clip(beauty[..., 3:], 0.0, 1.0)
+    centre = (np.arange(n) + 0.5) / n * 2.0 - 1.0
+    far = np.where(np.isfinite(depth), depth, 0.0) * np.sqrt(1.0 + centre[:, None] ** 2 + centre**2)
+    distance, colour = far[..., None] * cover, beauty[..., :3]
+    if background is not None:
+        colour, cover = colour + (1.0 - cover) * np.array(background), np.ones_like(cover)
+    texels[where] = np.concatenate([colour, cover, distance], axis=-1)[where]

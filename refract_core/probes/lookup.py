@@ -20,6 +20,7 @@ from ..optics.interface import probe_lod_hdrp
 from ..optics.lobes import Cone
 from ..scene import Camera, Probe
 from ..world.environment import EnvironmentTable, prefiltered
+from .depth import Depths, empty_depths, meet_depths
 from .faces import CUBE, WINDOW, Picture, Texel, direction_face, layout, level_at, level_count
 from .planar import window_of, window_weight
 from .reach import Reach, reach_of
@@ -58,6 +59,8 @@ class ProbeTable(NamedTuple):
     proxy_kind: U8_1D
     """shape (K,): 0 box, 1 sphere, 2 infinite"""
     proxy_extents: F64_2D
+    depths: Depths
+    """of those that march their own distances instead"""
     blend: F64_2D
     """shape (K, 6) [m]"""
     blend_normal: F64_2D
@@ -77,7 +80,7 @@ class ProbeLight(NamedTuple):
     coverage: float
     """0 .. 1: the share of it that is not sky"""
     fits: float
-    """factor on the probe's weight: 0 where a window does not show the place at all"""
+    """factor on the probe's weight: 0 where the picture does not show the place at all"""
     confidence: float
     """0 .. 1: how far the proxy's guess of the distance can be trusted"""
 
@@ -134,6 +137,7 @@ def empty_table(probes: list[Probe], drawn: list[bool], camera: Camera, rough: b
         proxy=each(lambda p: np.linalg.inv((p.proxy or p.influence).world_from_volume), np.float64, (4, 4)),
         proxy_kind=each(kind, np.uint8),
         proxy_extents=each(lambda p: (p.proxy or p.influence).extents, np.float64, (3,)),
+        depths=empty_depths(sizes, [p.marched and seen for p, seen in zip(probes, drawn, strict=True)]),
         blend=each(lambda p: p.blend_distance, np.float64, (6,)),
         blend_normal=each(lambda p: p.blend_normal_distance, np.float64, (6,)),
         face_fade=each(lambda p: p.face_fade, np.float64, (6,)),
@@ -214,17 +218,25 @@ def _cube_roughness(table: ProbeTable, k: int, ray: Cone, hdrp: bool, s: float, 
 
 @inlined
 def probe_light(
-    table: ProbeTable, k: int, ray: Cone, hdrp: bool, environment: EnvironmentTable, sky_follows: bool
+    table: ProbeTable, k: int, ray: Cone, hdrp: bool, environment: EnvironmentTable, sky_follows: bool, guesses: bool
 ) -> ProbeLight:
     """What probe `k` shows to a ray.
 
     Args:
         hdrp: roughness goes to levels by HDRP's mapping.
         sky_follows: a later tier will add the sky.
+        guesses: whether it is asked for what it does not know, which is then by its proxy, or for what it knows.
     """
-    # A picture knows what lies in a direction from the place it was taken at, not from the ray's origin. The proxy
-    # stands for the scene: where the ray meets it, the picture is asked.
-    s = proxy_distance(table, k, ray.origin, ray.direction)
+    # A picture knows what lies in a direction from the place it was taken at, not from the ray's origin. Its own
+    # distances say where the ray ends, or the proxy stands for the scene: there the picture is asked.
+    marches, known, s = table.depths.first[k] >= 0, True, 0.0
+    if marches:
+        met = meet_depths(table.depths, k, table.side[k, 0], row(table.capture, k), ray.origin, ray.direction)
+        known, s = met.known, met.distance
+    if known == guesses:
+        return ProbeLight((0.0, 0.0, 0.0), 1.0, 0.0, 0.0)
+    if guesses or not marches:
+        s = proxy_distance(table, k, ray.origin, ray.direction)
     meets = along(ray.origin, ray.direction, s)
     if table.planar[k] != 0:
         eye, m, e = table.eye[k], table.influence[k], row(table.influence_extents, k)
@@ -248,7 +260,7 @@ def probe_light(
         r, g, b, coverage, distance = cube_at(table, k, sky, probe_lod_hdrp(gloss))
     # The picture tells how far away the thing in it was; the nearer that is to the proxy, the better the guess.
     confidence = 0.0
-    if distance > 0.0 and far > 0.0:
+    if distance > 0.0 and far > 0.0 and not guesses:
         confidence = min(distance, far) / max(distance, far)
     # Where the picture is open the sky shows; without a sky nobody knows what is there, and the share is left open.
     if coverage < 1.0 and environment.present and not sky_follows:

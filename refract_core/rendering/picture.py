@@ -18,15 +18,20 @@ from ..kernels.compile import is_compiled
 from ..kernels.lanes import by_address
 from ..kernels.sampling import pixel_offsets
 from ..models import BY_TOKEN, SHEET, Behind
+from ..probes.capture import Over, face_camera, paste_face
+from ..probes.lookup import empty_table
+from ..probes.plan import seen_things
 from ..progress import COMPILING
-from ..scene import Camera, Notice, Scene
+from ..scene import F32, Camera, Notice, Probe, Scene
 from ..settings import RenderSettings
 from ..transport.pixels import tree_tile
 from ..version import __version__
 from ..view.camera import image_size, view_of
 from ..view.planes import by_name, finish_of, finish_tile, new_planes
+from ..world.embree import Bvh
+from ..world.tables import World, prim_of
 from .branching import Tree
-from .session import Session, choose_camera, prepare
+from .session import PROBE_SAMPLES, Session, choose_camera, prepare, prepare_bare
 from .work import Cancel, Progress, Work, tiles_of, working
 
 
@@ -64,7 +69,7 @@ def render(
     with working(executor, settings.jobs, progress, cancel) as work:
         if not is_compiled(tree_tile):
             work.progress(0.0, COMPILING)
-        session = prepare(scene, camera, settings, work)
+        session = prepare(scene, camera, settings, work, glass_over(scene, camera, settings, work))
         planes, rays = _draw(session, scene, camera, settings, (width, height), work)
         work.progress(1.0, "done")
     metadata: dict[str, str | float] = {
@@ -78,7 +83,8 @@ def render(
         "refract:metersPerUnit": scene.metres_per_unit,
         "refract:rays": float(rays + session.rays),
     }
-    notices = scene.notices + camera_light(scene) + open_meshes(scene, settings.model) + session.notices
+    notices = scene.notices + camera_light(scene) + open_meshes(scene, settings.model) + glass_twice(scene, settings)
+    notices += session.notices
     return Frame(width, height, planes, metadata, notices)
 
 
@@ -98,6 +104,15 @@ def open_meshes(scene: Scene, model: str) -> tuple[Notice, ...]:
             what = f"the mesh is open, so '{min(mine).token}' finds no far side; drawn as '{SHEET.token}'"
             found.append(Notice(mesh.path, f"{what}. Close the mesh, or set another model"))
     return tuple(found)
+
+
+def glass_twice(scene: Scene, settings: RenderSettings) -> tuple[Notice, ...]:
+    """Say which probes see glass that rays meet by themselves."""
+    if "probe" not in settings.tiers or settings.max_layers == 1:
+        return ()
+    text = "it sees glass (probe:captureRefraction), and rays meet that glass as well, so it may show twice"
+    seeing = [probe.path for probe in scene.probes if probe.sees_glass]
+    return tuple(Notice(path, f"{text}. Use --max-layers 1, or switch the attribute off") for path in seeing)
 
 
 def _draw(
@@ -124,3 +139,50 @@ def _told(work: Work, done: float, share: float) -> Callable[[float], None]:
 def _first_offset(settings: RenderSettings) -> tuple[float, float]:
     """Where in their pixels the places stand that the picture's data are of."""
     return (0.0, 0.0) if settings.by_corners else pixel_offsets(settings.samples)[0]
+
+
+# --- what probes see of glass ---------------------------------------------------------------------------------------
+
+
+def glass_over(
+    scene: Scene, camera: Camera, settings: RenderSettings, work: Work
+) -> Callable[[World, Bvh], Over]:
+    """What draws the glass that a probe sees into its picture: each face of the cube is a picture of its own, of which
+    those texels are taken that show glass. Probes do not see one another's pictures: rays answer, and the sky.
+
+    Args:
+        camera: of the picture; where a stage has no light it shines.
+    """
+    quiet = work._replace(progress=lambda _share, _stage: None)
+    samples = min(settings.samples, PROBE_SAMPLES)
+
+    def of_world(world: World, bvh: Bvh) -> Over:
+        def over(probe: Probe, texels: F32) -> int:
+            tiers = ("ray",) if probe.background else ("ray", "sky")
+            asked = replace(settings, samples=samples, tiers=tiers, screen="traced", exposure=0.0)
+            if probe.captured is None:
+                nobody = np.full(len(scene.meshes) + len(scene.spheres), -1, np.int32)
+                session, seen = Session(world, bvh, empty_table([], [], camera, False), nobody, 0, ()), scene
+            else:
+                seen = _part_of(scene, seen_things(scene, probe))
+                session = prepare_bare(seen, camera, quiet)
+            side, rays = texels.shape[1], 0
+            for face in range(len(texels)):
+                planes, traced = _draw(session, seen, face_camera(probe, face), asked, (side, side), quiet)
+                depth = planes["Z"] * scene.metres_per_unit
+                paste_face(texels[face], planes["mask"] > 0.0, planes["beauty"], depth, probe.background)
+                rays += traced
+            return rays
+
+        return over
+
+    return of_world
+
+
+def _part_of(scene: Scene, prims: frozenset[str]) -> Scene:
+    """The scene with these prims alone."""
+    return replace(
+        scene,
+        meshes=tuple(mesh for mesh in scene.meshes if prim_of(mesh.path) in prims),
+        spheres=tuple(ball for ball in scene.spheres if prim_of(ball.path) in prims),
+    )

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import UsageError
 from ..kernels.lanes import by_address
-from ..probes.capture import cubemap_of, fill_table
+from ..probes.capture import Over, cubemap_of, fill_table
 from ..probes.lookup import ProbeTable, empty_table
 from ..probes.plan import Plan, plan_capture, plan_picture
 from ..scene import Camera, Cubemap, Notice, Param, Probe, Scene
@@ -23,7 +23,7 @@ from ..world.lights import pack_lights
 from ..world.tables import World, pack_geometry, pack_materials, world_of
 from .work import Cancel, Progress, Work, working
 
-_PROBE_SAMPLES = 16
+PROBE_SAMPLES = 16
 """Most rays per probe texel; more samples of the picture do not make probes finer."""
 
 
@@ -52,17 +52,35 @@ def choose_camera(scene: Scene, name: str) -> Camera:
     raise UsageError(f"--camera {name}: the stage has no such camera; it has {known}")
 
 
-def prepare(scene: Scene, camera: Camera, settings: RenderSettings, work: Work) -> Session:
-    """Pack tables, build the BVH, capture probes."""
+def prepare(
+    scene: Scene, camera: Camera, settings: RenderSettings, work: Work, over: Callable[[World, Bvh], Over] | None = None
+) -> Session:
+    """Pack tables, build the BVH, capture probes.
+
+    Args:
+        over: given the packed scene, what draws the glass that probes see (`picture.glass_over`); None leaves it out.
+    """
     proxies = "screen" in settings.tiers and settings.screen == "proxy"
     chosen = plan_picture(scene, camera, drawn="probe" in settings.tiers, proxies=proxies)
     # Where pixels are made from corners, most of them are seen four times, however many samples edges take.
-    samples = min(max(1, settings.samples // 4) if settings.by_corners else settings.samples, _PROBE_SAMPLES)
-    return _prepare(scene, camera, chosen, is_rough(scene), samples, work, (0.1, 0.2))
+    samples = min(max(1, settings.samples // 4) if settings.by_corners else settings.samples, PROBE_SAMPLES)
+    return _prepare(scene, camera, chosen, is_rough(scene), samples, work, (0.1, 0.2), over)
+
+
+def prepare_bare(scene: Scene, camera: Camera, work: Work) -> Session:
+    """A scene made ready to be drawn without any probes."""
+    return _prepare(scene, camera, plan_capture(scene, []), False, 1, work, (0.0, 0.0))
 
 
 def _prepare(
-    scene: Scene, camera: Camera, chosen: Plan, rough: bool, samples: int, work: Work, span: tuple[float, float]
+    scene: Scene,
+    camera: Camera,
+    chosen: Plan,
+    rough: bool,
+    samples: int,
+    work: Work,
+    span: tuple[float, float],
+    over: Callable[[World, Bvh], Over] | None = None,
 ) -> Session:
     geometry, bvh, slots = pack_geometry(scene, chosen.captured_sets)
     world = by_address(
@@ -83,7 +101,7 @@ def _prepare(
         )
 
     work.progress(span[0], "probes")
-    rays = fill_table(table, entries, world, run, samples)
+    rays = fill_table(table, entries, world, run, samples, over and over(world, bvh))
     return Session(world, bvh, table, chosen.thing_probe, rays, chosen.notices)
 
 

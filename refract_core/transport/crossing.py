@@ -397,7 +397,8 @@ def _send_answered(to: Rays, i: int, meeting: Meeting, lane: int, c: int, rules:
     length = meeting.length[lane, c]
     leave, out = row(meeting.exits[lane], c), row(meeting.through[lane], c)
     if is_sheet(meeting.model[lane]) or not rules.measured or length <= 0.0:
-        put(to.origin, i, leave)
+        # Where there is no way inside, the exit lies on the very surface, and must not meet it again.
+        put(to.origin, i, leave if length > 0.0 else off_surface(leave, row(meeting.ng, lane), out))
         put(to.direction, i, out)
         left = transmittance(row(meeting.color, lane), meeting.distance[lane], length)
         put(to.weight, i, mul(row(to.weight, i), left))

@@ -180,16 +180,19 @@ def ask(query: Query, asking: Asking, work: TierScratch, world: World, times: in
         if tier == RAY:
             _ask_rays(query, ALL_RAYS, work, world, times)
             continue
-        sky_follows = False
+        sky_follows = ray_follows = False
         for j in range(i + 1, order.shape[0]):
             sky_follows = sky_follows or order[j] == SKY
+            ray_follows = ray_follows or order[j] == RAY
         for lane in range(LANES):
             if query.on[lane] == 0 or _headroom(query, lane) <= 1.0 - _SPENT:
                 continue
             if tier == SCREEN:
                 _ask_screen(query, lane, asking, work, world)
             elif tier == PROBE:
-                _ask_probes(query, lane, asking, world, sky_follows)
+                _ask_probes(query, lane, asking, world, sky_follows, False)
+                if not ray_follows and asking.probes.depths.inverse.shape[0] > 0:
+                    _ask_probes(query, lane, asking, world, sky_follows, True)
             elif tier == SKY and world.environment.present:
                 gloss = query.roughness[lane]
                 if query.by_proxy[lane] == 0:
@@ -259,27 +262,29 @@ def _note_surface(query: Query, lane: int, surface: Block, irradiance: Vec) -> N
 
 
 @inlined
-def _ask_probes(query: Query, lane: int, asking: Asking, world: World, sky_follows: bool) -> None:
-    """Every probe that reaches the ray's origin, in order."""
+def _ask_probes(query: Query, lane: int, asking: Asking, world: World, sky_follows: bool, guesses: bool) -> None:
+    """Every probe that reaches the ray's origin, in order: those that know what the ray meets, or those that do not."""
     probes = asking.probes
     p = row(query.origin, lane)
     cuts, sets = probes.reach.cuts, probes.reach.sets
     i, j, l = piece_of(cuts, 0, p[0]), piece_of(cuts, 1, p[1]), piece_of(cuts, 2, p[2])  # noqa: E741
     k = next_of(sets, i, j, l, 0)
     while k >= 0 and _headroom(query, lane) > 1.0 - _SPENT:
-        _ask_probe(query, lane, k, probes, world, sky_follows)
+        _ask_probe(query, lane, k, probes, world, sky_follows, guesses)
         k = next_of(sets, i, j, l, k + 1)
 
 
 @inlined
-def _ask_probe(query: Query, lane: int, k: int, probes: ProbeTable, world: World, sky_follows: bool) -> None:
+def _ask_probe(
+    query: Query, lane: int, k: int, probes: ProbeTable, world: World, sky_follows: bool, guesses: bool
+) -> None:
     origin, direction, n = row(query.origin, lane), row(query.direction, lane), row(query.normal, lane)
     w = influence(probes, k, origin, n, direction)
     if w <= 0.0:
         return
     ray = Cone(origin, direction, query.blur[lane], query.roughness[lane])
     light, coverage, fits, confidence = probe_light(
-        probes, k, ray, query.by_proxy[lane] != 0, world.environment, sky_follows and world.environment.present
+        probes, k, ray, query.by_proxy[lane] != 0, world.environment, sky_follows and world.environment.present, guesses
     )
     _, w = update_headroom(1.0 - _headroom(query, lane), w * fits)
     _add_covered(query, lane, PROBE, light, coverage, w, confidence)

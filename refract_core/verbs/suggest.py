@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..models import SHEET, Model
+from ..models import SHEET, Behind, Model
 from ..scene import Material, Mesh, Notice, Param, Scene, Source, Sphere
 from ..thickness.fit import alike, fit
 from ..usd.convert.author import Addition, add, begin
@@ -183,7 +183,7 @@ def candidates(scene: Scene, name: str, measured: Scene) -> Iterator[Candidate]:
     has_measured = any(_differs(a, b) for a, b in zip(things, _things(measured, name), strict=True))
     found = []
     for model in Model:
-        if model is Model.NONE:
+        if model.behind in (Behind.NOTHING, Behind.SCENE) and model is not now:  # neither stands for a body
             continue
         if not model.sized:
             found.append(Candidate(model, "", None, model is now))

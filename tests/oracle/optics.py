@@ -120,6 +120,11 @@ def through_slab(p: Vec, n: Vec, wo: Vec, ior: float, thickness: float) -> Passa
     return Passage(path, at(p, inside, path), scaled(wo, -1.0))
 
 
+def through_surface(p: Vec, n: Vec, wo: Vec, ior: float) -> Passage:
+    """One interface, without a way inside (Arm): the ray goes on from the surface's own point."""
+    return Passage(0.0, p, _unless_none(bent(scaled(wo, -1.0), facing(n, wo), 1.0 / ior)))
+
+
 def _unless_none(v: Vec | None) -> Vec:
     assert v is not None, "nothing is totally reflected on its way into the denser medium"
     return v

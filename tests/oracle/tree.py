@@ -391,7 +391,9 @@ class Tree:
                 direction=passage.direction, travelled=child.travelled + passage.path,
             )  # fmt: skip
         child = child._replace(media=choice.behind)
-        if self.by_proxy or passage.path == 0.0:
+        if passage.path == 0.0:  # it starts on the surface that it is to leave
+            return _beside(_out(child, Inner(body, passage)), s)
+        if self.by_proxy:
             return _out(child.absorb(passage.path), Inner(body, passage))
         inside = unit(sub(passage.point, s.point))
         return _beside(child._replace(direction=inside, far=passage.path, inner=Inner(body, passage)), s)
@@ -486,6 +488,8 @@ def _passage(model: Model, s: Surface, ior: float, thickness: float) -> Passage:
         return optics.through_sphere(s.point, s.ns, s.wo, ior, thickness)
     if model in (Model.BOX, Model.THIN):
         return optics.through_slab(s.point, s.ns, s.wo, ior, thickness)
+    if model is Model.SINGLE:
+        return optics.through_surface(s.point, s.ns, s.wo, ior)
     return Passage(0.0, s.point, scaled(s.wo, -1.0))
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from ...scene import F64, Notice, Probe, Volume
+from ...scene import F64, Cubemap, Notice, Probe, Volume
 from ..ours import PROBE as API
 from ..ours import applied, collection
 from ..values import triple
@@ -101,6 +101,7 @@ def _read_probe(source: ProbePrim, place: Place, frame: Frame) -> Probe:
     mode = token(source, "probe:mode", MODES)
     sphere = token(source, "probe:shape", ("box", "sphere")) == "sphere"
     influence = own_volume(source, place, frame, "influence", sphere)
+    proxy, marched = proxy_of(source, place, frame, influence, planar)
 
     def number(name: str, high: float = INF) -> float:
         return floats(source, f"probe:{name}", (0.0,), (high,))[0]
@@ -110,12 +111,14 @@ def _read_probe(source: ProbePrim, place: Place, frame: Frame) -> Probe:
         mode="realtime" if planar and mode == "custom" else mode,
         capture_point=_capture_point(source, frame, unit, planar),
         influence=influence,
-        proxy=proxy_of(source, place, frame, influence),
+        proxy=proxy,
+        marched=marched,
         resolution=int(floats(source, "probe:resolution", RESOLUTION[:1], RESOLUTION[1:])[0]),
         clipping=_clipping(source, unit),
         planar=planar,
         background=_background(source),
         distance_roughness=_distance_roughness(source, planar),
+        sees_glass=_sees_glass(source, mode, planar),
         captured=_captured(source),
         importance=int(number("importance", 32767)),
         weight=number("weight", 1.0),
@@ -130,7 +133,18 @@ def _with_picture(source: ProbePrim, probe: Probe, read_cubemap: ReadCubemap) ->
         refuse_picture(source, token(source, "probe:mode", MODES))
         return probe
     cubemap, bake = picture_of(source, probe.mode, probe.resolution, read_cubemap)
-    return replace(probe, cubemap=cubemap, bake=bake)
+    return replace(probe, cubemap=cubemap, bake=bake, marched=probe.marched and _has_distances(source, cubemap))
+
+
+def _has_distances(source: ProbePrim, cubemap: Cubemap | None) -> bool:
+    """There is something to march; a notice where a picture that shows anything does not say how far away it is."""
+    if cubemap is None or cubemap.levels[0][..., 4].any() or not cubemap.levels[0][..., 3].any():
+        return True
+    source.say(
+        "probe:proxy is 'depth', but probe:texture has no distances (a channel Z in metres); the influence volume is "
+        "used. Bake it with refract bake probes STAGE OUT, or set probe:proxy to 'influence' or 'volume'"
+    )
+    return False
 
 
 def _edges(source: ProbePrim, frame: Frame, unit: float, influence: Volume, planar: bool) -> dict[str, Any]:
@@ -185,6 +199,15 @@ def _distance_roughness(source: ProbePrim, planar: bool) -> bool:
     if wanted and planar:
         source.say("probe:distanceBasedRoughness is ignored: it is for cubemaps, not for planar probes. Remove it")
     return wanted and not planar
+
+
+def _sees_glass(source: ProbePrim, mode: str, planar: bool) -> bool:
+    wanted, name = flag(source, "probe:captureRefraction"), "probe:captureRefraction"
+    if wanted and planar:
+        source.say(f"{name} is ignored: it is for cubemaps, not for planar probes. Remove it")
+    elif wanted and mode != "realtime":
+        source.say(f"{name} is ignored: the mode is '{mode}', and only realtime probes see glass. Set probe:mode")
+    return wanted and not planar and mode == "realtime"
 
 
 def _captured(source: ProbePrim) -> tuple[str, ...] | None:

@@ -77,13 +77,22 @@ def own_volume(probe: ProbePrim, place: Place, frame: Frame, which: str, sphere:
     return Volume(frame.world_from_volume, sphere, (x, y, z))
 
 
-def proxy_of(probe: ProbePrim, place: Place, frame: Frame, influence: Volume) -> Volume | None:
-    """What the surroundings are taken to lie on; None is infinitely far."""
-    kind = token(probe, "probe:proxy", ("influence", "volume", "infinite"))
+def proxy_of(
+    probe: ProbePrim, place: Place, frame: Frame, influence: Volume, planar: bool
+) -> tuple[Volume | None, bool]:
+    """What the surroundings are taken to lie on; None is infinitely far. And whether the picture's distances say it
+    better."""
+    kind = token(probe, "probe:proxy", ("influence", "volume", "infinite", "depth"))
+    if kind == "depth" and planar:
+        probe.say("probe:proxy is 'depth', which is for cubemaps, not for planar probes; the influence volume is used")
+    return _volume_of(probe, place, frame, influence, kind), kind == "depth" and not planar
+
+
+def _volume_of(probe: ProbePrim, place: Place, frame: Frame, influence: Volume, kind: str) -> Volume | None:
     targets = probe.prim.GetRelationship("probe:proxy:prim").GetForwardedTargets()
     if targets and kind != "volume":
         probe.say(f"probe:proxy:prim is ignored, for probe:proxy is '{kind}'; set that to 'volume' to use it")
-    if kind == "influence":
+    if kind in ("influence", "depth"):
         return influence
     if kind == "infinite":
         return None
