@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..kernels.compile import is_compiled
 from ..kernels.lanes import by_address, scratch
 from ..kernels.sampling import pixel_offsets
 from ..models import BY_TOKEN
@@ -30,6 +31,11 @@ from .work import tiles_of
 
 _SKY_STEP = 3.0
 """Of the tolerance: by how much the share of the sky may change over a cell."""
+
+
+def needs_compiling(settings: RenderSettings) -> bool:
+    """The largest kernel that these settings ask for is not there yet."""
+    return not is_compiled(corner_tile if settings.by_corners else tree_tile)
 
 
 class Tree:
@@ -86,7 +92,7 @@ class Tree:
         refining = by_address(
             Refining(
                 settings.tolerance, exposure, np.concatenate(sets), np.cumsum([0, *map(len, sets)]), settings.samples,
-                rays, max(1, rays // settings.samples),
+                rays, max(1, rays // few),
             )
         )  # fmt: skip
         world, asking, samples_view = self.session.world, by_address(self._asking(corners)), by_address(view)

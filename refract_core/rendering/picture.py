@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..images.frame import Frame
-from ..kernels.compile import is_compiled
 from ..kernels.lanes import by_address
 from ..kernels.sampling import pixel_offsets
 from ..models import BY_TOKEN, SHEET, Behind
@@ -24,13 +23,12 @@ from ..probes.plan import seen_things
 from ..progress import COMPILING
 from ..scene import F32, Camera, Notice, Probe, Scene
 from ..settings import RenderSettings
-from ..transport.pixels import tree_tile
 from ..version import __version__
 from ..view.camera import image_size, view_of
 from ..view.planes import by_name, finish_of, finish_tile, new_planes
 from ..world.embree import Bvh
 from ..world.tables import World, prim_of
-from .branching import Tree
+from .branching import Tree, needs_compiling
 from .session import PROBE_SAMPLES, Session, choose_camera, prepare, prepare_bare
 from .work import Cancel, Progress, Work, tiles_of, working
 
@@ -67,7 +65,7 @@ def render(
     camera = choose_camera(scene, settings.camera)
     width, height = image_size(camera, settings.image_width, settings.image_height)
     with working(executor, settings.jobs, progress, cancel) as work:
-        if not is_compiled(tree_tile):
+        if needs_compiling(settings):
             work.progress(0.0, COMPILING)
         session = prepare(scene, camera, settings, work, glass_over(scene, camera, settings, work))
         planes, rays = _draw(session, scene, camera, settings, (width, height), work)
