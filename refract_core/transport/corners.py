@@ -196,6 +196,7 @@ def _keep_opaque(
     light = row(opaque.color[y], x)
     put(cell.color, slot, light)
     cell.missing[slot] = 1.0 - opaque.color[y, x, 3]
+    cell.chance[slot] = opaque.hits.chance[y, x]
     cell.z_depth[slot] = opaque.depth[y, x]
     put(cell.normal, slot, row(opaque.normal[y], x))
     if opaque.depth[y, x] == math.inf:
@@ -414,6 +415,8 @@ def _contrast(scratch: TreeScratch, own: CornerScratch, refining: Refining, slot
     cell = scratch.cell
     least, all_missing = math.inf, -math.inf
     for k in range(4):
+        if cell.chance[_corner(slot, k)] != 0:  # that four agree says nothing
+            return 1.0
         missing = cell.missing[_corner(slot, k)]
         least, all_missing = min(least, missing), max(all_missing, missing)
     return max(most, all_missing - least)

@@ -90,6 +90,8 @@ class Cell(NamedTuple):
     """and how many surfaces it entered"""
     glass: I32_1D
     """1 where the view ray met an interface, or is in a medium"""
+    chance: I32_1D
+    """1 where something that one of its rays met is there by chance, or is not"""
     z_depth: F64_1D
     """of the first surface [m]"""
     normal: F64_2D
@@ -141,7 +143,7 @@ def _new_cell(count: int) -> Cell:
     columns = {"color": 3, "refraction": 3, "reflection": 3, "weight": 3, "clear": 3, "tiers": 5, "normal": 3}
 
     def array(name: str) -> Any:
-        if name in ("x", "y", "sample", "entered", "glass"):
+        if name in ("x", "y", "sample", "entered", "glass", "chance"):
             return np.zeros(count, np.int32)
         return np.zeros((count, columns[name])) if name in columns else np.zeros(count)
 
@@ -187,7 +189,7 @@ def clear_slot(cell: Cell, i: int) -> None:
     for k in range(5):
         cell.tiers[i, k] = 0.0
     cell.missing[i] = cell.confidence[i] = cell.share[i] = cell.largest[i] = cell.path[i] = 0.0
-    cell.entered[i] = cell.glass[i] = 0
+    cell.entered[i] = cell.glass[i] = cell.chance[i] = 0
     cell.z_depth[i] = math.inf
     cell.thickness[i] = 0.0
 
@@ -251,11 +253,13 @@ def _trace(scratch: TreeScratch, world: World, rules: Rules, taken: int) -> None
     for lane in range(taken):
         found = has_hit(packet, lane)
         packet.valid[lane] = 0
+        if packet.chance[lane] != 0:
+            scratch.cell.chance[now.pixel[lane]] = 1
         if not found:
             continue
         hit = hit_in(packet, lane, world.geometry)
         keep_hit(met, lane, hit)
-        if world.materials.model[hit.material] == Model.NONE.value:
+        if world.materials.model[hit.material] == Model.NONE.value or world.geometry.touched[hit.part] == 0:
             continue
         # Where glass touches an opaque object, as on a table, the two surfaces tie, and the ray could come out on the
         # far side of the table: from inside, an opaque surface within rounding of the glass takes it. "Inside" is in a

@@ -49,14 +49,16 @@ class PictureHits(NamedTuple):
     primitive: I32_2D
     instance: I32_2D
     material: I32_2D
+    chance: I32_2D
+    """1 where it is there by chance, or something else is not"""
     u: F32_2D
     v: F32_2D
 
 
 def new_hits(width: int, height: int) -> PictureHits:
     """Room for the hits of a picture."""
-    words, numbers = np.zeros((4, height, width), np.int32), np.zeros((2, height, width), np.float32)
-    return PictureHits(words[0], words[1], words[2], words[3], numbers[0], numbers[1])
+    words, numbers = np.zeros((5, height, width), np.int32), np.zeros((2, height, width), np.float32)
+    return PictureHits(words[0], words[1], words[2], words[3], words[4], numbers[0], numbers[1])
 
 
 class OpaqueLayer(NamedTuple):
@@ -157,7 +159,10 @@ def keep_hits(hits: PictureHits, packet: Packet, world: World, x0: int, y0: int,
     """Note the hits of a block of pixels, as far as they are within the picture."""
     for lane in range(LANES):
         x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
-        if x >= width or y >= height or not has_hit(packet, lane):
+        if x >= width or y >= height:
+            continue
+        hits.chance[y, x] = packet.chance[lane]
+        if not has_hit(packet, lane):
             continue
         hit = hit_in(packet, lane, world.geometry)
         hits.part[y, x], hits.primitive[y, x], hits.instance[y, x] = hit.part, hit.primitive, hit.instance

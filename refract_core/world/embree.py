@@ -207,6 +207,8 @@ class Packet(NamedTuple):
     """shape (1,) int64: rays traced so far"""
     asked: Flags
     """`valid` as the caller of `tracing.intersect_world` set it, while it looks behind cut-outs"""
+    chance: Flags
+    """1 where the ray of a lane met a surface that is there by chance, or not (`tracing.intersect_world`)"""
     shadowed: Flags
     """`valid` as the caller of `tracing.visible` set it, while it looks behind cut-outs"""
     ends: Scalars
@@ -228,6 +230,7 @@ class Packet(NamedTuple):
             arguments=arguments,
             tally=np.zeros(1, np.int64),
             asked=np.zeros(LANES, np.int32),
+            chance=np.zeros(LANES, np.int32),
             shadowed=np.zeros(LANES, np.int32),
             ends=np.zeros(LANES),
         )

@@ -40,6 +40,8 @@ class Geometry(NamedTuple):
     """shape (G,): index of the prim, meshes first, then spheres"""
     sheet: U8_1D
     """shape (G,): 1 where the surface is open, so that both of its sides face the air"""
+    touched: U8_1D
+    """shape (G,): 1 where the bounds of something opaque reach into those of a part of glass, so that they may touch"""
     normals: F32_3D
     """shape (N, 3, 3): corner normals"""
     first_normal: I64_1D
@@ -95,6 +97,8 @@ class World(NamedTuple):
     environment: EnvironmentTable
     cutouts: bool
     """Some material is a cut-out, so that hits must be looked at."""
+    lit: bool
+    """Some light or the sky shines; otherwise all light is emitted, and falls on nothing."""
 
 
 def world_of(
@@ -105,7 +109,8 @@ def world_of(
     environment: EnvironmentTable,
 ) -> World:
     """Put the tables together."""
-    return World(geometry, materials, textures, lights, environment, bool(materials.cutout.any()))
+    lit = len(lights.kind) > 0 or (environment.present and not environment.dark)
+    return World(geometry, materials, textures, lights, environment, bool(materials.cutout.any()), lit)
 
 
 def pack_materials(materials: Sequence[Material], slots: dict[str, int]) -> MaterialTable:
@@ -178,10 +183,13 @@ class _Pile:
         self.primvars: list[NDArray[np.float32]] = []
         self.rows: list[tuple[int, tuple[float, ...], int, bool, int]] = []
         self.primvar_rows: list[list[tuple[int, int, int]]] = []
+        self.bounds: list[tuple[Any, Any]] = []
         self.point_count = self.triangle_count = self.normal_count = self.primvar_count = 0
 
     def add(self, part: Part, material: NDArray[np.int32], thing: int, sheet: bool,
-            normals: NDArray[np.float32] | None, primvars: dict[str, NDArray[np.float32]]) -> None:  # fmt: skip
+            normals: NDArray[np.float32] | None, primvars: dict[str, NDArray[np.float32]],
+            bounds: tuple[Any, Any]) -> None:  # fmt: skip
+        self.bounds.append(bounds)
         first_normal = -1
         if normals is not None:
             first_normal = self.normal_count
@@ -241,6 +249,7 @@ def pack_geometry(
         sphere=np.array(sphere, np.float32).reshape(-1, 4),
         thing=np.array(thing_of, np.int32),
         sheet=np.array(sheet, np.uint8),
+        touched=_touched(pile),
         normals=np.concatenate(pile.normals) if pile.normals else np.zeros((0, 3, 3), np.float32),
         first_normal=np.array(first_normal, np.int64),
         primvars=np.concatenate(pile.primvars) if pile.primvars else np.zeros(0, np.float32),
@@ -249,6 +258,20 @@ def pack_geometry(
         primvar_size=np.ascontiguousarray(primvar_rows[:, :, 2]),
     )
     return geometry, bvh, slots
+
+
+def _touched(pile: _Pile) -> NDArray[np.uint8]:
+    """`Geometry.touched`, by bounds that are wider than any margin of `offsets`."""
+    touched = np.zeros(len(pile.parts), np.uint8)
+    if not pile.parts:
+        return touched
+    low, high = (np.array([bounds[k] for bounds in pile.bounds], np.float64) for k in range(2))
+    margin = 2e-4 * np.maximum(np.abs(low), np.abs(high)).max(axis=1, keepdims=True) + 2e-5
+    low, high = low - margin, high + margin
+    glass = np.array([bool(part.mask & int(REFRACTIVE)) for part in pile.parts])
+    for k in np.flatnonzero(glass):
+        touched[k] = ((low[~glass] <= high[k]) & (high[~glass] >= low[k])).all(axis=1).any()
+    return touched
 
 
 def prim_of(path: str) -> str:
@@ -271,6 +294,7 @@ def _add_mesh(pile: _Pile, scene: Scene, mesh: Mesh, thing: int, captured_sets: 
     used, which = np.unique(mesh.materials, return_inverse=True)
     masks = [_mask(scene.materials[m], mesh.static, mesh.path, captured_sets) for m in used]
     mask_of_triangle = np.array(masks, np.int64)[which]
+    bounds = (mesh.points.min(axis=0), mesh.points.max(axis=0)) if len(mesh.points) else (np.zeros(3), np.zeros(3))
     base = pile.point_count
     pile.points.append(mesh.points)
     pile.point_count += len(mesh.points)
@@ -284,6 +308,7 @@ def _add_mesh(pile: _Pile, scene: Scene, mesh: Mesh, thing: int, captured_sets: 
             not mesh.closed,
             None if mesh.normals is None else mesh.normals[keep],
             primvars,
+            bounds,
         )
 
 
@@ -291,7 +316,9 @@ def _add_sphere(pile: _Pile, scene: Scene, ball: Sphere, thing: int, captured_se
     part = Part(
         _mask(scene.materials[ball.material], ball.static, ball.path, captured_sets), None, (*ball.centre, ball.radius)
     )
-    pile.add(part, np.array([ball.material], np.int32), thing, False, None, ball.primvars)
+    centre = np.array(ball.centre)
+    bounds = (centre - ball.radius, centre + ball.radius)
+    pile.add(part, np.array([ball.material], np.int32), thing, False, None, ball.primvars, bounds)
 
 
 def _check_mesh(mesh: Mesh, material_count: int) -> None:

@@ -63,9 +63,22 @@ def _absent(world: World, packet: Packet, lane: int) -> bool:
 
 
 @inlined
+def _is_by_chance(world: World, packet: Packet, lane: int) -> bool:
+    """The hit in a lane is on a `presence` material."""
+    m = hit_in(packet, lane, world.geometry).material
+    return world.materials.cutout[m] != 0 and world.materials.threshold[m] <= 0.0
+
+
+@inlined
 def intersect_world(packet: Packet, world: World, far: Scalars, coherent: bool) -> None:
-    """Nearest present hit of every active lane. `far`: the T_FAR each lane started with."""
+    """Nearest present hit of every active lane; and `packet.chance`, where it is there, or others are not, by chance.
+
+    Args:
+        far: the T_FAR each lane started with.
+    """
     handle = world.geometry.handle
+    for lane in range(LANES):
+        packet.chance[lane] = 0
     intersect(packet, handle, coherent)
     if not world.cutouts:
         return
@@ -75,6 +88,8 @@ def intersect_world(packet: Packet, world: World, far: Scalars, coherent: bool) 
         again = False
         for lane in range(LANES):
             absent = has_hit(packet, lane) and _absent(world, packet, lane)
+            if has_hit(packet, lane) and _is_by_chance(world, packet, lane):
+                packet.chance[lane] = 1
             packet.valid[lane] = 0
             if absent:
                 restart(packet, lane, past(hit_distance(packet, lane)), far[lane])
