@@ -48,7 +48,7 @@ def settings_of(seed: int) -> rc.RenderSettings:
     chosen["screen"] = "proxy" if seed % 13 == 6 else "traced"
     chosen["exposure"] = 1.0 if seed % 17 == 8 else 0.0
     chosen["model"] = {9: "box", 10: "traced", 11: "thin", 12: "sphere", 13: "single"}.get(seed % 19, "")
-    return rc.RenderSettings(image_width=WIDTH, image_height=HEIGHT, jobs=1, **chosen)
+    return rc.RenderSettings(image_width=WIDTH, image_height=HEIGHT, jobs=1, tolerance=0.0, **chosen)
 
 
 def scene_of(seed: int) -> Scene:

@@ -71,7 +71,7 @@ TABLE = (
     Attribute(PROBE, "probe:distanceBasedRoughness", "bool", False, uniform=True),
     Attribute(PROBE, "probe:fadeDistance", "float", 10000.0, minimum=0.0),
     Attribute(PROBE, "collection:captured:includeRoot", "bool", True, uniform=True),
-    Attribute(SETTINGS, "refract:samples", "int", 4, minimum=1, maximum=4096, uniform=True),
+    Attribute(SETTINGS, "refract:samples", "int", 16, minimum=1, maximum=4096, uniform=True),
     Attribute(SETTINGS, "refract:tiers", "token[]", ("screen", "probe", "ray", "sky"), TIERS, uniform=True),
     Attribute(SETTINGS, "refract:maxLayers", "int", 16, minimum=1, maximum=32, uniform=True),
 )

@@ -16,7 +16,7 @@ from ..kernels.sampling import Key, pixel_offsets, set_key
 from ..kernels.vec import along, length, normalize, row, scale, transform_direction, transform_point
 from ..scene import Camera, Cubemap, Probe
 from ..world.embree import COHERENT, Packet, clear, set_ray
-from ..world.shading import ONE_RAY, Block, load_hits, shade
+from ..world.shading import Block, load_hits, shade
 from ..world.tables import World
 from ..world.tracing import intersect_world
 from .depth import fill_depths
@@ -122,7 +122,7 @@ def capture_rows(
                     set_ray(packet, lane, centre, scale(d, 1.0 / stretch), start, limit[lane], shot.mask)
                 intersect_world(packet, world, limit, COHERENT)
                 load_hits(block, packet, world, spread)
-                shade(block, second, packet, world, shot.mask, ONE_RAY)
+                shade(block, second, packet, world, shot.mask)
                 _keep_texels(table, shot, face, block, bx, by, y1)
     return packet.tally[0]
 

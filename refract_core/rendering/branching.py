@@ -13,7 +13,7 @@ from ..kernels.sampling import pixel_offsets
 from ..models import BY_TOKEN
 from ..scene import Camera, Scene
 from ..settings import SCREEN_METHODS, TIERS, RenderSettings
-from ..transport.corners import CornerScratch, Refining, corner_tile
+from ..transport.corners import PATCH, CornerScratch, Refining, corner_tile
 from ..transport.crossing import Rules
 from ..transport.eye import view_ray
 from ..transport.pixels import tree_tile
@@ -106,7 +106,7 @@ class Tree:
                 )
             )
 
-        yield Pass(draw, self.tiles, 0.7)
+        yield Pass(draw, tiles_of(width, height, PATCH), 0.7)
 
     def _sample_passes(self, view: View, sample: int, share: float) -> Iterator[Pass]:
         yield from self._opaque_passes(view, sample, self.tiles, 0.3 * share)

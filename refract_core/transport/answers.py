@@ -19,7 +19,7 @@ from ..kernels.vec import Vec, flip_towards, mul, row, scale
 from ..world.shading import Block
 from ..world.surface import NOTHING, Hit, HitLanes, Interaction, Ray, interaction, keep_hit, kept_hit
 from ..world.tables import World
-from .rays import VIEW, Rays
+from .rays import THROUGH_SIDE, VIEW, Rays
 from .tiers import Query
 
 MOST_ANSWERS = 32
@@ -97,7 +97,7 @@ def add_answer(answers: Answers, slot: int, leaves: Rays, k: int, query: Query, 
     keep_hit(answers.hits, r, hit)
     d = row(leaves.direction, k)
     answers.way[r] = np.int32(hash32(leaves.way[k], hit.part, 0))
-    answers.side[r] = leaves.side[k]
+    answers.side[r] = max(THROUGH_SIDE, leaves.side[k])  # what an eye in glass sees has come through, too
     put(answers.weight, r, row(leaves.weight, k))
     put(answers.direction, r, d)
     put(answers.point, r, d)

@@ -33,7 +33,7 @@ from .tiers import Asking
 from .tree import CELL, SLOTS, TreeScratch, clear_slot, follow, start
 
 PATCH = 32
-"""Pixels along the side of a patch, which is done at once."""
+"""Pixels along the side of a patch, a tile that is done at once."""
 _ROW = PATCH + 1
 """Corners along it."""
 _GLASS_ONLY, _ALL = flag(False), flag(True)
@@ -104,7 +104,7 @@ class CornerScratch(NamedTuple):
         )  # fmt: skip
 
 
-# --- a tile -------------------------------------------------------------------------------------------------------
+# --- a patch ------------------------------------------------------------------------------------------------------
 
 
 @kernel
@@ -121,7 +121,8 @@ def corner_tile(
     opaque: OpaqueLayer,
     planes: Planes,
 ) -> int:
-    """Draw a tile: `planes` get as much as they would from all samples.
+    """Draw a patch: `planes` get as much as they would from all samples. What is added up in which order hangs on the
+    patch, so the picture is cut into patches in one way only.
 
     Args:
         asking: its screen shows the corners.
@@ -132,23 +133,21 @@ def corner_tile(
         Rays traced.
     """
     scratch.packet.tally[0] = scratch.work.packet.tally[0] = 0
-    for y0 in range(tile[1], min(tile[3], view.size[1]), PATCH):
-        for x0 in range(tile[0], min(tile[2], view.size[0]), PATCH):
-            width, height = min(PATCH, view.size[0] - x0), min(PATCH, view.size[1] - y0)
-            keep_answers(scratch.answers, True)
-            _draw_corners(
-                scratch, world, asking, rules, view_ray, opaque, x0, y0, width + 1, height + 1,
-                refining.corner_rays,
-            )  # fmt: skip
-            keep_answers(scratch.answers, False)
-            edges = 0
-            for j in range(height):
-                for i in range(width):
-                    wanted = _draw_pixel(scratch, own, world, refining, planes, x0 + i, y0 + j, j * _ROW + i)
-                    if wanted >= 0:
-                        own.edges[edges], own.sets[edges] = j * PATCH + i, wanted
-                        edges += 1
-            _draw_edges(scratch, own, world, asking, rules, view_ray, refining, view, planes, x0, y0, edges)
+    x0, y0 = tile[0], tile[1]
+    width, height = min(PATCH, view.size[0] - x0), min(PATCH, view.size[1] - y0)
+    keep_answers(scratch.answers, True)
+    _draw_corners(
+        scratch, world, asking, rules, view_ray, opaque, x0, y0, width + 1, height + 1, refining.corner_rays
+    )
+    keep_answers(scratch.answers, False)
+    edges = 0
+    for j in range(height):
+        for i in range(width):
+            wanted = _draw_pixel(scratch, own, world, refining, planes, x0 + i, y0 + j, j * _ROW + i)
+            if wanted >= 0:
+                own.edges[edges], own.sets[edges] = j * PATCH + i, wanted
+                edges += 1
+    _draw_edges(scratch, own, world, asking, rules, view_ray, refining, view, planes, x0, y0, edges)
     return scratch.packet.tally[0] + scratch.work.packet.tally[0]
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from ..kernels.compile import flag, inlined, kernel
+from ..kernels.compile import flag, inlined, kernel, word
 from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES
 from ..kernels.sampling import Key
 from ..view.camera import Tile, View
 from ..view.gbuffer import OpaqueLayer
 from ..view.planes import Planes
-from ..world.shading import ONE_RAY
 from ..world.tables import World
 from .answers import keep_answers
 from .crossing import Rules
@@ -18,7 +17,7 @@ from .tree import Cell, TreeScratch, clear_slot, follow, start
 
 SIDE = 8
 """Pixels along the side of a cell."""
-_GLASS_ONLY = flag(False)
+_GLASS_ONLY, _ONE_RAY = flag(False), word(1)
 
 
 @kernel
@@ -48,7 +47,7 @@ def tree_tile(
         for x0 in range(tile[0], tile[2], SIDE):
             count = _start_cell(scratch, view, view_ray, opaque, x0, y0, sample)
             if count > 0:
-                follow(scratch, world, asking, rules, view, count, _GLASS_ONLY, ONE_RAY)
+                follow(scratch, world, asking, rules, view, count, _GLASS_ONLY, _ONE_RAY)
             _add_cell(planes, scratch.cell, opaque, view, x0, y0, sample)
     return scratch.packet.tally[0] + scratch.work.packet.tally[0]
 

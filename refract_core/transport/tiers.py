@@ -27,7 +27,7 @@ from ..view.pyramid import Screen
 from ..view.screen import light_seen, screen_blurred, screen_march, screen_proxy
 from ..world.embree import OPAQUE, SCATTERED, Packet, clear, set_ray
 from ..world.environment import prefiltered
-from ..world.shading import ONE_RAY, Block, load_hits, load_surface, nth, shade
+from ..world.shading import Block, load_hits, load_surface, nth, shade
 from ..world.surface import NOTHING, HitLanes, Ray, interaction, kept_hit
 from ..world.tables import World
 from ..world.tracing import intersect_world
@@ -70,6 +70,8 @@ class Query(NamedTuple):
     """1: it is a view ray that has met no glass"""
     strong: Flags
     """1: much of its pixel's light comes this way, so that a ray of its own is worth its price"""
+    rays: Words
+    """that it sends to each light and to the sky, or into its cone"""
     by_proxy: Flags
     """1: it asks the screen by HDRP's proxy, and maps roughness as HDRP does"""
     width: Scalars
@@ -158,8 +160,8 @@ def _headroom(query: Query, lane: int) -> float:
 
 
 @inlined
-def ask(query: Query, asking: Asking, work: TierScratch, world: World, times: int) -> None:
-    """Fill colour, weight and confidence of every lane that is on. `times`: rays of strong leaves to each light."""
+def ask(query: Query, asking: Asking, work: TierScratch, world: World) -> None:
+    """Fill colour, weight and confidence of every lane that is on."""
     inside = False
     for lane in range(LANES):
         for c in range(3):
@@ -173,12 +175,12 @@ def ask(query: Query, asking: Asking, work: TierScratch, world: World, times: in
         if asking.quiet and query.on[lane] != 0 and query.direct[lane] != 0:
             _ask_screen_traced(query, lane, asking, work, world)  # it is the eye's own picture
     if inside:  # what lies inside the glass is near, and known to be met: nobody can guess it better than a ray
-        _ask_rays(query, EMBEDDED_ONLY, work, world, times)
+        _ask_rays(query, EMBEDDED_ONLY, work, world)
     order = asking.order
     for i in range(order.shape[0]):
         tier = order[i]
         if tier == RAY:
-            _ask_rays(query, ALL_RAYS, work, world, times)
+            _ask_rays(query, ALL_RAYS, work, world)
             continue
         sky_follows = ray_follows = False
         for j in range(i + 1, order.shape[0]):
@@ -293,39 +295,38 @@ def _ask_probe(
 
 @inlined
 def _ask_rays(
-    query: Query, embedded: bool, work: TierScratch, world: World, times: int
+    query: Query, embedded: bool, work: TierScratch, world: World
 ) -> None:
     """Light of what every lane with weight left meets; `embedded` lanes only, or all. A cone sends rays of its own, as
     many as a strong leaf sends to a light."""
     packet, second = work.packet, work.second
-    some = scatters = strong = False
+    some = False
+    most = 0
     for lane in range(LANES):
         work.sent[lane] = 0
         if query.on[lane] == 0 or _headroom(query, lane) <= 1.0 - _SPENT:
             continue
         if embedded and query.embedded[lane] == 0:
             continue
-        strong = strong or query.strong[lane] != 0
         if query.blur[lane] > 0.0:
-            scatters = True
+            most = max(most, query.rays[lane])
             work.sent[lane] = 1
         elif query.met.part[lane] != NOTHING:
             some = True
             work.sent[lane] = 2
-    rays = times if strong else ONE_RAY
     if some:
-        _shade_met(query, work, world, rays)
-    if not scatters:
+        _shade_met(query, work, world)
+    if most == 0:
         return
     for lane in range(LANES):
         query.scattered[lane] = 0.0
         put(query.gathered, lane, (0.0, 0.0, 0.0))
-    for k in range(rays):
+    for k in range(most):
         clear(packet)
         for lane in range(LANES):
             second.on[lane] = 0
-            if work.sent[lane] == 1:
-                key = nth(key_of(query.key, lane), k, rays)
+            if work.sent[lane] == 1 and k < query.rays[lane]:
+                key = nth(key_of(query.key, lane), k, query.rays[lane])
                 set_key(second.key, lane, key)
                 u1, u2 = unit_pair(key, Purpose.ROUGH_LEAF.value)
                 d = _scatter(row(query.direction, lane), query.blur[lane], u1, u2)
@@ -333,11 +334,12 @@ def _ask_rays(
                 set_ray(packet, lane, row(query.origin, lane), d, 0.0, math.inf, OPAQUE)
         intersect_world(packet, world, work.far, SCATTERED)
         load_hits(second, packet, world, 0.0)
-        shade(second, work.third, packet, world, OPAQUE, ONE_RAY)
+        shade(second, work.third, packet, world, OPAQUE)
         for lane in range(LANES):
             if work.sent[lane] == 1 and second.on[lane] != 0:
-                query.scattered[lane] += 1.0 / rays
-                put(query.gathered, lane, add(row(query.gathered, lane), scale(row(second.color, lane), 1.0 / rays)))
+                share = 1.0 / query.rays[lane]
+                query.scattered[lane] += share
+                put(query.gathered, lane, add(row(query.gathered, lane), scale(row(second.color, lane), share)))
     for lane in range(LANES):
         if work.sent[lane] == 1 and query.scattered[lane] > 0.0:  # what met nothing is left to the next tier
             _add_covered(
@@ -346,7 +348,7 @@ def _ask_rays(
 
 
 @inlined
-def _shade_met(query: Query, work: TierScratch, world: World, rays: int) -> None:
+def _shade_met(query: Query, work: TierScratch, world: World) -> None:
     """Light of the lanes whose hit is known."""
     second = work.second
     for lane in range(LANES):
@@ -358,7 +360,8 @@ def _shade_met(query: Query, work: TierScratch, world: World, rays: int) -> None
             at = interaction(world.geometry, kept_hit(query.met, lane), ray, query.width[lane])
             second.on[lane] = 1
             load_surface(second, lane, at, world, scale(d, -1.0))
-    shade(second, work.third, work.packet, world, OPAQUE, rays)
+            second.rays[lane] = query.rays[lane]
+    shade(second, work.third, work.packet, world, OPAQUE)
     for lane in range(LANES):
         if second.on[lane] != 0:
             _note_surface(query, lane, second, row(second.diffuse, lane))

@@ -23,7 +23,7 @@ from ..view.camera import View, pixel_ray
 from ..world.embree import COHERENT, EVERYTHING, OPAQUE, SCATTERED, Packet, clear, has_hit, set_ray
 from ..world.environment import TEXEL_LUMINANCE, radiance
 from ..world.offsets import tie
-from ..world.shading import ONE_RAY, Block, gather, load_surface
+from ..world.shading import Block, gather, load_surface
 from ..world.surface import NOTHING, HitLanes, Ray, hit_in, interaction, keep_hit, kept_hit
 from ..world.tables import World
 from ..world.tracing import intersect_world
@@ -348,7 +348,7 @@ def _shine(scratch: TreeScratch, world: World, taken: int) -> None:
             set_key(block.key, lane, Key(cell.x[i], cell.y[i], now.branch[lane], cell.sample[i]))
     if not some:
         return
-    gather(block, scratch.packet, world, OPAQUE, ONE_RAY)
+    gather(block, scratch.packet, world, OPAQUE)
     for lane in range(taken):
         if block.on[lane] == 0:
             continue
@@ -407,8 +407,8 @@ def _ask_all(
         for lane in range(LANES):
             query.on[lane] = 0
             if first + lane < leaves:
-                _load_query(scratch, world, asking, view, first + lane, lane, alone)
-        ask(query, asking, scratch.work, world, times)
+                _load_query(scratch, world, asking, view, first + lane, lane, alone, times)
+        ask(query, asking, scratch.work, world)
         for lane in range(min(LANES, leaves - first)):
             if query.on[lane] != 0:
                 _add_leaf(scratch, world, first + lane, lane, view)
@@ -416,7 +416,7 @@ def _ask_all(
 
 @inlined
 def _load_query(
-    scratch: TreeScratch, world: World, asking: Asking, view: View, k: int, lane: int, alone: bool
+    scratch: TreeScratch, world: World, asking: Asking, view: View, k: int, lane: int, alone: bool, times: int
 ) -> None:
     query, leaves, cell = scratch.query, scratch.leaves, scratch.cell
     i = leaves.pixel[k]
@@ -443,6 +443,7 @@ def _load_query(
     query.embedded[lane] = 1 if inside or direct else 0
     strongest = max(leaves.weight[k, 0], leaves.weight[k, 1], leaves.weight[k, 2])
     query.strong[lane] = 1 if strongest > _STRONG else 0
+    query.rays[lane] = times if strongest > _STRONG else 1
     query.by_proxy[lane] = 1 if asking.method == PROXY and leaves.side[k] != MIRRORED_SIDE else 0
 
 
@@ -468,7 +469,7 @@ def _add_leaf(scratch: TreeScratch, world: World, k: int, lane: int, view: View)
         cell.color[i, c] += light
         if leaves.side[k] == MIRRORED_SIDE:
             cell.reflection[i, c] += light
-        else:
+        elif cell.glass[i] != 0:
             cell.refraction[i, c] += light
             cell.weight[i, c] += w
             cell.clear[i, c] += leaves.clear[k, c]

@@ -22,7 +22,7 @@ from ..world.embree import (
     set_ray,
 )
 from ..world.environment import radiance
-from ..world.shading import ONE_RAY, Block, load_hits, shade
+from ..world.shading import Block, load_hits, shade
 from ..world.surface import Hit, hit_in
 from ..world.tables import World
 from ..world.tracing import intersect_world
@@ -133,7 +133,7 @@ def opaque_tile(
             if layer.hits.part.shape[0] > 0:
                 keep_hits(layer.hits, packet, world, x0, y0, width, height)
             load_hits(block, packet, world, view.spread)
-            shade(block, scratch.second, packet, world, OPAQUE, ONE_RAY)
+            shade(block, scratch.second, packet, world, OPAQUE)
             write_opaque(layer, block, world, view, x0, y0)
     return packet.tally[0], glass
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from ..kernels.compile import inlined, word
-from ..kernels.lanes import LANES, Flags, Scalars, Vectors, put
+from ..kernels.compile import inlined
+from ..kernels.lanes import LANES, Flags, Scalars, Vectors, Words, put
 from ..kernels.sampling import MIRRORED, Key, Keys, Purpose, branched, key_of, set_key, unit_pair
 from ..kernels.vec import Vec, add, dot, flip_towards, frame, lerp, mul, normalize, row, scale, sub
 from ..optics.interface import f0_from_ior
@@ -31,8 +31,6 @@ _POLISHED_ROUGHNESS = 0.2
 take their reflection from the environment map alone."""
 _COAT_F0 = 0.04  # a clear coat of ior 1.5 (UsdPreviewSurface)
 _COSINE_CANDIDATES = 2
-ONE_RAY = word(1)
-"""To each light: where a picture takes many samples."""
 
 
 class Block(NamedTuple):
@@ -68,6 +66,8 @@ class Block(NamedTuple):
     """share of the sky that the material lets in, 0 .. 1"""
     matte: Flags
     """1 where diffuse light is asked for; 0 leaves `diffuse` at nothing, and saves its shadow rays"""
+    rays: Words
+    """that go to each light and to the sky; 1, unless somebody wants more"""
     distance: Scalars
     """hit distance [m]; inf where nothing was hit"""
 
@@ -159,7 +159,7 @@ def load_surface(block: Block, lane: int, at: Interaction, world: World, wo: Vec
     block.coat[lane] = share_input(world, at, Param.CLEARCOAT.value)
     block.coat_roughness[lane] = share_input(world, at, Param.CLEARCOAT_ROUGHNESS.value)
     block.occlusion[lane] = share_input(world, at, Param.OCCLUSION.value)
-    block.matte[lane] = 1
+    block.matte[lane] = block.rays[lane] = 1
 
 
 @inlined
@@ -201,7 +201,7 @@ def forget_light(block: Block, lane: int) -> None:
 
 
 @inlined
-def _gather_lights(block: Block, packet: Packet, world: World, mask: int, times: int) -> None:
+def _gather_lights(block: Block, packet: Packet, world: World, mask: int) -> None:
     """Add every light's irradiance to `diffuse` and its highlights to `specular`, with shadows."""
     lights = world.lights
     for l in range(lights.kind.shape[0]):  # noqa: E741
@@ -211,15 +211,20 @@ def _gather_lights(block: Block, packet: Packet, world: World, mask: int, times:
             if block.on[lane] != 0 and aim_light(block, lane, lights, l) and lights.casts_shadow[l] != 0:
                 block.lamp_asked[lane] = 1
                 block.lamp_seen[lane] = 0.0
-        for k in range(times if lights.casts_shadow[l] != 0 else 0):
+        most = 0
+        for lane in range(LANES):
+            if block.lamp_asked[lane] != 0:
+                most = max(most, block.rays[lane])
+        for k in range(most):
             clear(packet)
             for lane in range(LANES):
-                if block.lamp_asked[lane] != 0:
-                    add_light_ray(block, lane, lights, l, packet, lane, nth(key_of(block.key, lane), k, times))
+                if block.lamp_asked[lane] != 0 and k < block.rays[lane]:
+                    key = nth(key_of(block.key, lane), k, block.rays[lane])
+                    add_light_ray(block, lane, lights, l, packet, lane, key)
             visible(packet, world, mask, block.free)
             for lane in range(LANES):
-                if block.lamp_asked[lane] != 0:
-                    block.lamp_seen[lane] += block.free[lane] / times
+                if block.lamp_asked[lane] != 0 and k < block.rays[lane]:
+                    block.lamp_seen[lane] += block.free[lane] / block.rays[lane]
         for lane in range(LANES):
             if block.on[lane] != 0:
                 add_light(block, lane, lights, l)
@@ -276,25 +281,27 @@ def add_light(block: Block, lane: int, lights: LightTable, l: int) -> None:  # n
 
 
 @inlined
-def _gather_sky(block: Block, packet: Packet, world: World, mask: int, times: int) -> None:
+def _gather_sky(block: Block, packet: Packet, world: World, mask: int) -> None:
     """Add the environment's irradiance to `diffuse`. Its unoccluded value is exact; how much of it arrives is asked
     along directions chosen in proportion to what they would bring (`_sky_direction`). The same answer dims the sky's
     highlight (`_add_gloss_of_sky`)."""
     environment = world.environment
     if not environment.present or environment.dark:
         return
+    most = 0
     for lane in range(LANES):
         block.sky_seen[lane] = block.sky_asked[lane] = 0.0
-    for k in range(times):
+        if block.on[lane] != 0 and block.matte[lane] != 0:
+            most = max(most, block.rays[lane])
+    for k in range(most):
         clear(packet)
         for lane in range(LANES):
-            if block.on[lane] != 0 and block.matte[lane] != 0:
-                block.sky_weight[lane] = add_sky_ray(
-                    block, lane, environment, packet, lane, key_of(block.key, lane), k, times
-                )
+            if block.on[lane] != 0 and block.matte[lane] != 0 and k < block.rays[lane]:
+                key, rays = key_of(block.key, lane), block.rays[lane]
+                block.sky_weight[lane] = add_sky_ray(block, lane, environment, packet, lane, key, k, rays)
         visible(packet, world, mask, block.free)
         for lane in range(LANES):
-            if block.on[lane] != 0 and block.matte[lane] != 0:
+            if block.on[lane] != 0 and block.matte[lane] != 0 and k < block.rays[lane]:
                 block.sky_seen[lane] += block.sky_weight[lane] * block.free[lane]
                 block.sky_asked[lane] += block.sky_weight[lane]
     for lane in range(LANES):
@@ -396,19 +403,15 @@ def _cosine_direction(n: Vec, u1: float, u2: float) -> Vec:
 
 
 @inlined
-def gather(block: Block, packet: Packet, world: World, mask: int, times: int) -> None:
+def gather(block: Block, packet: Packet, world: World, mask: int) -> None:
     """What arrives at every hit: irradiance into `diffuse`, the lights' highlights into `specular`.
 
-    Args:
-        mask: what casts shadows.
-        times: rays to each light and to the sky.
-
-    The packet is overwritten.
+    `mask`: what casts shadows. The packet is overwritten.
     """
     for lane in range(LANES):
         forget_light(block, lane)
-    _gather_lights(block, packet, world, mask, times)
-    _gather_sky(block, packet, world, mask, times)
+    _gather_lights(block, packet, world, mask)
+    _gather_sky(block, packet, world, mask)
 
 
 @inlined
@@ -443,16 +446,12 @@ def _reflects_the_scene(f0: Vec, roughness: float) -> bool:
 
 
 @inlined
-def shade(block: Block, second: Block, packet: Packet, world: World, mask: int, times: int) -> None:
+def shade(block: Block, second: Block, packet: Packet, world: World, mask: int) -> None:
     """Radiance of every hit in `block` into `block.color`. `second` is another block, for what the mirrors show.
 
-    Args:
-        mask: what reflections and shadows may meet.
-        times: rays to each light and to the sky.
-
-    The packet is overwritten.
+    `mask`: what reflections and shadows may meet. The packet is overwritten.
     """
-    gather(block, packet, world, mask, times)
+    gather(block, packet, world, mask)
     send_back(block, second, packet, world, mask)
 
 
@@ -487,7 +486,7 @@ def _add_mirrored(block: Block, second: Block, packet: Packet, world: World, mas
         set_key(second.key, lane, branched(key_of(block.key, lane), MIRRORED))
     intersect_world(packet, world, block.bounce_end, SCATTERED)
     load_hits(second, packet, world, 0.0)
-    gather(second, packet, world, mask, ONE_RAY)
+    gather(second, packet, world, mask)
     _add_matt(second)
     for lane in range(LANES):
         if block.bounced[lane] == 0:

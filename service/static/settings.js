@@ -9,7 +9,7 @@ const GLASS_NUMBERS = ["ior", "thickness", "roughness", "absorptionDistance"];
 export function defaultSettings(facts) {
   const authored = facts?.settings ?? {};
   return {
-    camera: "", time_code: null, image_width: 480, image_height: 0, samples: authored.samples ?? 4, exposure: 0,
+    camera: "", time_code: null, image_width: 480, image_height: 0, samples: authored.samples ?? 16, exposure: 0,
     tiers: [...(authored.tiers ?? ["screen", "probe", "ray", "sky"])], screen: "traced", model: "",
     max_layers: authored.max_layers ?? 16, overrides: {},
   };
