@@ -316,8 +316,9 @@ def add_sky_ray(
 ) -> float:
     """Put ray `k` of `times` from hit `i` to the sky into a lane. Returns for how much it counts among them."""
     n = row(block.ns, i)
-    direction, weight = _sky_direction(environment, n, nth(key, k, times)), 1.0
-    if times > 1 and not environment.even:
+    if times == 1 or environment.even:
+        direction, weight = _sky_direction(environment, n, nth(key, k, times)), 1.0
+    else:
         direction, weight = _nth_sky_direction(environment, n, key, k, times)
     add_shadow_ray(packet, lane, row(block.point, i), row(block.ng, i), direction, math.inf)
     return weight
