@@ -271,8 +271,9 @@ def made(name: str, options: Options) -> str:
 
 def put(found: Mapping[str, Part], options: Options, page: Path = PAGE, readme: Path = pages.README) -> None:
     """Write what was measured into its places."""
-    pages.write(page, {name: f"{made(name, options)}\n\n{part.page}" for name, part in found.items()})
-    pages.write(readme, {name: part.readme for name, part in found.items() if part.readme})
+    for path, told in ((page, lambda part: part.page), (readme, lambda part: part.readme)):
+        texts = {name: told(part) for name, part in found.items()}
+        pages.write(path, {name: f"{made(name, options)}\n\n{text}" for name, text in texts.items() if text})
 
 
 def _names(text: str) -> tuple[str, ...]:
