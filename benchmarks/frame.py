@@ -19,6 +19,7 @@ import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
 import refract_core as rc
 from refract_core.kernels.compile import kernel
@@ -63,10 +64,11 @@ def bare_seconds_per_ray(scene: rc.Scene, width: int, height: int, jobs: int, re
     return best
 
 
-def cold_seconds(stage: str, options: list[str], repeat: int) -> float:
-    """Median of fresh processes that render the stage to a PNG."""
+def cold_seconds(stage: str, options: list[str], repeat: int, suffix: str = ".png") -> float:
+    """Median of fresh processes that render the stage to a picture."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "refract_core.cli", "render", stage, str(Path(folder) / "out.png"), *options]
+        out = str(Path(folder) / f"out{suffix}")
+        command = [sys.executable, "-m", "refract_core.cli", "render", stage, out, *options]
         subprocess.run(command, check=True)  # compiles what is not compiled yet
         times = []
         for _ in range(repeat):
@@ -74,6 +76,41 @@ def cold_seconds(stage: str, options: list[str], repeat: int) -> float:
             subprocess.run(command, check=True)
             times.append(time.perf_counter() - start)
     return statistics.median(times)
+
+
+class Warm(NamedTuple):
+    """Frames of one stage in one process, and bare Embree."""
+
+    size: tuple[int, int]
+    """[pixels]"""
+    times: tuple[float, ...]
+    """seconds of each frame"""
+    rays: int
+    """of a frame"""
+    bare: float
+    """seconds of as many rays of the camera alone, on the same threads"""
+
+    @property
+    def seconds(self) -> float:
+        return statistics.median(self.times)
+
+    @property
+    def ratio(self) -> float:
+        return self.seconds / self.bare
+
+
+def warm(scene: rc.Scene, settings: rc.RenderSettings, repeat: int) -> Warm:
+    """Draw a scene again and again."""
+    jobs = settings.jobs or os.cpu_count() or 1
+    frame = rc.render(scene, settings)
+    times = []
+    for _ in range(repeat):
+        start = time.perf_counter()
+        rc.render(scene, settings)
+        times.append(time.perf_counter() - start)
+    rays = int(frame.metadata["refract:rays"])
+    size = image_size(scene.cameras[0], settings.image_width, settings.image_height)
+    return Warm(size, tuple(times), rays, bare_seconds_per_ray(scene, *size, jobs, repeat) * rays)
 
 
 def main() -> None:
@@ -96,22 +133,14 @@ def main() -> None:
         image_width=arguments.width, image_height=arguments.height, samples=arguments.samples, jobs=jobs,
         tiers=tuple(arguments.tiers.split(",")),
     )  # fmt: skip
-    frame = rc.render(scene, settings)
-    times = []
-    for _ in range(arguments.repeat):
-        start = time.perf_counter()
-        rc.render(scene, settings)
-        times.append(time.perf_counter() - start)
-    warm = statistics.median(times)
-    rays = int(frame.metadata["refract:rays"])
-    width, height = image_size(scene.cameras[0], arguments.width, arguments.height)
-    bare = bare_seconds_per_ray(scene, width, height, jobs, arguments.repeat) * rays
+    found = warm(scene, settings, arguments.repeat)
+    width, height = found.size
     print(f"{Path(arguments.stage).name}, {width}x{height}, {arguments.samples} sample(s), {jobs} threads")
     print(f"cold process            {cold:8.3f} s")
-    print(f"warm frame              {warm:8.3f} s   (min {min(times):.3f}, max {max(times):.3f})")
-    print(f"rays                    {rays:8d}     {rays / warm / 1e6:.1f} Mray/s in the frame")
-    print(f"bare Embree, same count {bare:8.3f} s   {rays / bare / 1e6:.1f} Mray/s")
-    print(f"warm / bare             {warm / bare:8.2f}")
+    print(f"warm frame              {found.seconds:8.3f} s   (min {min(found.times):.3f}, max {max(found.times):.3f})")
+    print(f"rays                    {found.rays:8d}     {found.rays / found.seconds / 1e6:.1f} Mray/s in the frame")
+    print(f"bare Embree, same count {found.bare:8.3f} s   {found.rays / found.bare / 1e6:.1f} Mray/s")
+    print(f"warm / bare             {found.ratio:8.2f}")
 
 
 if __name__ == "__main__":

@@ -58,6 +58,8 @@ LEVELS: dict[str, dict[str, Any]] = {level: named_settings(level) for level in (
 BEST: tuple[str, dict[str, Any]] = ("reference", {**named_settings("reference"), "samples": 64})
 """The nearest to the truth that ours can come; drawn once, and not timed by turns."""
 DECIBELS = (31, 33, 37, 43, 45, 49)
+CACHE = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "refract-benchmarks"
+"""Where the truth is kept if nobody says otherwise."""
 _WINDOW = 5
 _SAME = 1.0 / 255.0
 _ENOUGH = 20.0
@@ -276,7 +278,7 @@ def report(room: Room, found: Measured, options: Options) -> list[str]:
     return [f"{title}; {samples}", *table(found), "", *ratios(found), "", f"a picture of 16 x 9 pixels: {smallest}", ""]
 
 
-def _plot(folder: Path, room: Room, found: Measured) -> list[Path]:
+def plot(folder: Path, room: Room, found: Measured) -> list[Path]:
     """Write a chart for every region but the one that is not ours to draw."""
     folder.mkdir(parents=True, exist_ok=True)
     written = []
@@ -297,8 +299,12 @@ def _names(text: str) -> tuple[str, ...]:
     return tuple(text.split(","))
 
 
-def _mitsuba(variant: str, jobs: int) -> Any:
-    """Mitsuba, slower where LLVM is not to be had."""
+def mitsuba(variant: str, jobs: int) -> Any:
+    """Mitsuba, slower where LLVM is not to be had.
+
+    Raises:
+        UsageError: it is not installed, or this variant is not.
+    """
     try:
         return library(variant, jobs)
     except UsageError as error:
@@ -310,7 +316,6 @@ def _mitsuba(variant: str, jobs: int) -> Any:
 
 def main() -> None:
     """Print the tables and write the charts."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "refract-benchmarks"
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rooms", type=_names, default=tuple(ROOMS))
     parser.add_argument("--size", type=int, default=640, help="width of the picture [pixels]; 16:9")
@@ -319,7 +324,7 @@ def main() -> None:
     parser.add_argument("--reference-samples", type=int, default=4096, help="of the truth")
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--jobs", type=int, default=0)
-    parser.add_argument("--cache", type=Path, default=cache, help="where the truth is kept")
+    parser.add_argument("--cache", type=Path, default=CACHE, help="where the truth is kept")
     parser.add_argument("--plots", type=Path, help="where the charts are written; default: the cache")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="of Mitsuba")
     chosen = parser.parse_args()
@@ -331,7 +336,7 @@ def main() -> None:
         chosen.cache,
     )  # fmt: skip
     try:
-        mi = _mitsuba(chosen.variant, chosen.jobs)
+        mi = mitsuba(chosen.variant, chosen.jobs)
     except UsageError as error:
         parser.error(str(error))
     for name in chosen.rooms:
@@ -342,7 +347,7 @@ def main() -> None:
             print(f"{room.name} room left out: {error}", file=sys.stderr)
             continue
         print("\n".join(report(room, found, options)))
-        for path in _plot(chosen.plots or chosen.cache, room, found):
+        for path in plot(chosen.plots or chosen.cache, room, found):
             print(f"wrote {path}")
         print()
 
