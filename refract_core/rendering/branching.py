@@ -31,6 +31,9 @@ from .work import tiles_of
 
 _SKY_STEP = 3.0
 """Of the tolerance: by how much the share of the sky may change over a cell."""
+_SKY_NOISE = 0.8
+"""Times the number of rays to the power of -3/4: by how much it may change by chance. Cells that noise cuts in four get
+nodes with fewer rays, and more noise."""
 
 
 def needs_compiling(settings: RenderSettings) -> bool:
@@ -60,7 +63,7 @@ class Tree:
         self.by_corners = settings.by_corners
         self.size = (width, height)
         width, height = (width + 1, height + 1) if self.by_corners else (width, height)
-        self.screen = new_screen_buffers(width, height, is_rough(scene))
+        self.screen = new_screen_buffers(width, height, is_rough(scene), self.by_corners)
         self.blurring = by_address(new_blur_scratch(self.screen.color_level))
         # The opaque layer is level 0 of the screen's pyramids.
         self.opaque = OpaqueLayer(
@@ -69,6 +72,7 @@ class Tree:
             self.screen.normal,
             self.screen.irradiance,
             self.screen.gloss,
+            self.screen.seen,
             np.zeros((height, width), np.uint8),
             new_hits(width, height) if self.by_corners else new_hits(0, 0),
         )
@@ -83,7 +87,7 @@ class Tree:
 
     def _corner_passes(self) -> Iterator[Pass]:
         settings, (width, height) = self.settings, self.size
-        view = view_of(self.camera, width, height, samples=settings.samples)
+        view = view_of(self.camera, width, height)
         corners = corners_of(view_of(self.camera, width, height))
         yield from self._quiet_passes(corners, 0.3)
         exposure = self.camera.exposure_scale * 2.0**settings.exposure
@@ -122,15 +126,17 @@ class Tree:
     def _quiet_passes(self, view: View, share: float) -> Iterator[Pass]:
         """Draw the corners' picture without glass, and what the screen tier reads of it."""
         world, camera, opaque = self.session.world, by_address(view), by_address(self.opaque)
-        care = by_address(Care(self.settings.light_samples, min(0.5, _SKY_STEP * self.settings.tolerance)))
+        rays = self.settings.light_samples
+        step = max(_SKY_STEP * self.settings.tolerance, _SKY_NOISE / rays**0.75)
+        care = by_address(Care(rays, min(0.5, step)))
         width, height = self.size
         glassy: list[Tile] = []
 
         def look(tile: Tile) -> int:
-            rays, glass = quiet_tile(world, camera, scratch(QuietScratch), care, tile, opaque)
+            traced, glass = quiet_tile(world, camera, scratch(QuietScratch), care, tile, opaque)
             if glass:
                 glassy.append(tile)
-            return int(rays)
+            return int(traced)
 
         yield Pass(look, tiles_of(width + 1, height + 1, QUIET_SIDE), share)
         if TIERS.index("screen") in self.order and glassy:

@@ -19,7 +19,7 @@ from ..kernels.compile import flag, inlined, kernel
 from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, put
 from ..kernels.sampling import Key
 from ..kernels.vec import Vec, add, dot, length, lerp, mul, normalize, row, scale, sub
-from ..view.camera import Tile, View, pixel_ray
+from ..view.camera import Tile, View, pixel_point, pixel_ray
 from ..view.gbuffer import OpaqueLayer
 from ..view.planes import Planes
 from ..world.shading import load_surface
@@ -30,7 +30,7 @@ from .crossing import Rules
 from .pixels import add_glass, add_light, keep_glass, keep_place
 from .rays import MIRRORED_SIDE, THROUGH_SIDE, Rays
 from .tiers import Asking
-from .tree import CELL, SLOTS, TreeScratch, clear_slot, follow, start
+from .tree import CELL, SLOTS, Cell, TreeScratch, clear_slot, follow, start
 
 PATCH = 32
 """Pixels along the side of a patch, a tile that is done at once."""
@@ -48,6 +48,10 @@ _PER_TOLERANCE = 0.8
 """Samples, to the power of 3/4, for each tolerance that corners differ by."""
 _PAINTED = 0.2
 """Times the tolerance, below which a texture is not looked at between the corners."""
+_SMOOTH_PIXEL = -1
+"""That takes no set of samples."""
+_EDGE_ON = 0.1
+"""Cosine below which a surface is seen too slantingly to say where it is elsewhere."""
 _MOST_TAPS = 8
 """Along each side of a quadrilateral."""
 
@@ -56,7 +60,7 @@ class Refining(NamedTuple):
     """Which pixels are drawn with samples of their own, and with which."""
 
     tolerance: float
-    """largest difference between corners that is passed, of the square root of light, clipped at 1"""
+    """largest difference between corners that is passed, of the square root of light; above 1, of half its logarithm"""
     exposure: float
     """of the picture: what light is multiplied with before it is looked at"""
     offsets: F64_2D
@@ -126,7 +130,7 @@ def corner_tile(
 
     Args:
         asking: its screen shows the corners.
-        view: of the samples at edges.
+        view: of the pixels.
         opaque: the corners' opaque picture, with hits.
 
     Returns:
@@ -143,8 +147,8 @@ def corner_tile(
     edges = 0
     for j in range(height):
         for i in range(width):
-            wanted = _draw_pixel(scratch, own, world, refining, planes, x0 + i, y0 + j, j * _ROW + i)
-            if wanted >= 0:
+            wanted = _draw_pixel(scratch, own, world, refining, view, planes, x0 + i, y0 + j, j * _ROW + i)
+            if wanted != _SMOOTH_PIXEL:
                 own.edges[edges], own.sets[edges] = j * PATCH + i, wanted
                 edges += 1
     _draw_edges(scratch, own, world, asking, rules, view_ray, refining, view, planes, x0, y0, edges)
@@ -171,6 +175,7 @@ def _draw_corners(
                 if opaque.glass[y, x] == 0 and not submerged:
                     _keep_opaque(scratch, world, view, opaque, x, y, slot)
                 else:
+                    scratch.cell.spread[slot] = view.spread
                     count = start(scratch, view, view_ray, count, slot, x + 0.5, y + 0.5, Key(x, y, 0, 0))
             if count > CELL - LANES:
                 follow(scratch, world, asking, rules, view, count, _GLASS_ONLY, times)
@@ -219,7 +224,7 @@ def _keep_opaque(
 
 @inlined
 def _draw_pixel(
-    scratch: TreeScratch, own: CornerScratch, world: World, refining: Refining, planes: Planes,
+    scratch: TreeScratch, own: CornerScratch, world: World, refining: Refining, view: View, planes: Planes,
     x: int, y: int, slot: int,
 ) -> int:  # fmt: skip
     """Make a pixel of its corners. Of an edge, for which nothing is done, which set of samples it takes; else -1."""
@@ -261,8 +266,8 @@ def _draw_pixel(
     contrast = _contrast(scratch, own, refining, slot)
     if contrast > refining.tolerance:
         return _set_for(refining, contrast)
-    _write_pixel(scratch, planes, refining.samples, x, y, slot, color, through, mirrored)
-    return -1
+    _write_pixel(scratch, planes, refining.samples, x, y, slot, color, through, mirrored, view.orthographic)
+    return _SMOOTH_PIXEL
 
 
 @inlined
@@ -394,8 +399,9 @@ def _moved(world: World, hit: Hit, off: Vec) -> Hit:
 
 @inlined
 def _shown(light: float, exposure: float) -> float:
-    """About how bright it is to the eye."""
-    return math.sqrt(min(1.0, max(0.0, light * exposure)))
+    """About how bright it is to the eye; above white by ratios, so that highlights count in pictures that keep them."""
+    shown = max(0.0, light * exposure)
+    return math.sqrt(shown) if shown < 1.0 else 1.0 + 0.5 * math.log(shown)
 
 
 @inlined
@@ -438,15 +444,16 @@ def _set_for(refining: Refining, contrast: float) -> int:
 @inlined
 def _write_pixel(
     scratch: TreeScratch, planes: Planes, samples: int, x: int, y: int, slot: int,
-    color: Vec, through: Vec, mirrored: Vec,
+    color: Vec, through: Vec, mirrored: Vec, orthographic: bool,
 ) -> None:  # fmt: skip
     """Write a pixel's light, and the mean of what else its corners know."""
     cell = scratch.cell
-    z, normal, missing = 0.0, (0.0, 0.0, 0.0), 0.0
+    nearness, z, normal, missing = 0.0, 0.0, (0.0, 0.0, 0.0), 0.0
     glass = -1
     for k in range(4):
         i = _corner(slot, k)
         z += 0.25 * cell.z_depth[i]
+        nearness += 0.25 / cell.z_depth[i]
         normal = add(normal, row(cell.normal, i))
         missing += 0.25 * cell.missing[i]
         if cell.glass[i] != 0:
@@ -462,7 +469,8 @@ def _write_pixel(
         keep_glass(planes, cell, glass, x, y)
     if dot(normal, normal) > 0.0:
         normal = normalize(normal)
-    planes.z_depth[y, x] = z
+    # Over a plane depth is affine in the picture for parallel rays, and its reciprocal for those from a point.
+    planes.z_depth[y, x] = z if orthographic or nearness == 0.0 else 1.0 / nearness
     for c in range(3):
         planes.normal[y, x, c] = normal[c]
 
@@ -483,12 +491,27 @@ def _draw_edges(
         for place in range(first, end):
             own.places[count], own.times[count] = place, refining.samples / (end - first)
             px, py = x + 0.5 + refining.offsets[place, 0], y + 0.5 + refining.offsets[place, 1]
+            scratch.cell.spread[count] = view.spread / math.sqrt(end - first)
             count = start(scratch, view, view_ray, count, count, px, py, Key(x, y, 0, place - first))
             if count == CELL:
                 _draw_samples(scratch, own, world, asking, rules, refining, view, planes, count)
                 count = 0
     if count > 0:
         _draw_samples(scratch, own, world, asking, rules, refining, view, planes, count)
+
+
+@inlined
+def _depth_in_middle(view: View, cell: Cell, slot: int, px: float, py: float, dx: float, dy: float) -> float:
+    """z_depth in the middle of a pixel of the surface that a sample beside it has met, as if it were flat [m]."""
+    z = cell.z_depth[slot]
+    if z == math.inf:
+        return z
+    point, normal = pixel_point(view, px + dx, py + dy, z), row(cell.normal, slot)
+    origin, direction, cosine = pixel_ray(view, px, py)
+    facing = dot(direction, normal)
+    if abs(facing) < _EDGE_ON:
+        return z
+    return dot(sub(point, origin), normal) / facing * cosine
 
 
 @inlined
@@ -505,6 +528,8 @@ def _draw_samples(
         if cell.glass[slot] != 0:
             add_glass(planes, cell, slot, x, y, own.times[slot])
         if cell.sample[slot] == 0:
+            offset = refining.offsets[own.places[slot]]
+            cell.z_depth[slot] = _depth_in_middle(view, cell, slot, x + 0.5, y + 0.5, offset[0], offset[1])
             keep_place(planes, cell, slot, x, y)
             if cell.glass[slot] != 0:
                 keep_glass(planes, cell, slot, x, y)

@@ -67,6 +67,7 @@ def _start_cell(
         if x >= view.size[0] or y >= view.size[1]:
             continue
         if opaque.glass[y, x] != 0 or view_ray.media.depth[0] > 0:
+            scratch.cell.spread[slot] = view.spread
             count = start(scratch, view, view_ray, count, slot, x + 0.5, y + 0.5, Key(x, y, 0, sample))
     return count
 

@@ -27,7 +27,7 @@ from ..view.pyramid import Screen
 from ..view.screen import light_seen, screen_blurred, screen_march, screen_proxy
 from ..world.embree import OPAQUE, SCATTERED, Packet, clear, set_ray
 from ..world.environment import prefiltered
-from ..world.shading import Block, load_hits, load_surface, nth, shade
+from ..world.shading import LOBES, Block, gloss, load_hits, load_surface, nth, shade
 from ..world.surface import NOTHING, HitLanes, Ray, interaction, kept_hit
 from ..world.tables import World
 from ..world.tracing import intersect_world
@@ -196,10 +196,10 @@ def ask(query: Query, asking: Asking, work: TierScratch, world: World) -> None:
                 if not ray_follows and asking.probes.depths.inverse.shape[0] > 0:
                     _ask_probes(query, lane, asking, world, sky_follows, True)
             elif tier == SKY and world.environment.present:
-                gloss = query.roughness[lane]
+                lobe = query.roughness[lane]
                 if query.by_proxy[lane] == 0:
-                    gloss = math.sqrt(min(1.0, 0.5 * query.blur[lane]))
-                light = prefiltered(world.environment, row(query.direction, lane), gloss)
+                    lobe = math.sqrt(min(1.0, 0.5 * query.blur[lane]))
+                light = prefiltered(world.environment, row(query.direction, lane), lobe)
                 _add(query, lane, SKY, light, _headroom(query, lane), 1.0)
 
 
@@ -252,7 +252,10 @@ def _ask_screen_traced(query: Query, lane: int, asking: Asking, work: TierScratc
     load_surface(surface, lane, at, world, scale(d, -1.0))
     _note_surface(query, lane, surface, seen.irradiance)
     lit = scale(mul(row(surface.albedo, lane), seen.irradiance), 1.0 / math.pi)
-    _add(query, lane, SCREEN, add(add(row(surface.emissive, lane), lit), seen.gloss), _headroom(query, lane), 1.0)
+    gleam = seen.gloss
+    if asking.quiet:  # how much light arrives is the place's; what it mirrors is the ray's
+        gleam = gloss(surface, lane, world, seen.lamps, seen.sky)
+    _add(query, lane, SCREEN, add(add(row(surface.emissive, lane), lit), gleam), _headroom(query, lane), 1.0)
 
 
 @inlined
@@ -361,6 +364,7 @@ def _shade_met(query: Query, work: TierScratch, world: World) -> None:
             second.on[lane] = 1
             load_surface(second, lane, at, world, scale(d, -1.0))
             second.rays[lane] = query.rays[lane]
+            second.lobes[lane] = max(1, query.rays[lane] // LOBES)
     shade(second, work.third, work.packet, world, OPAQUE)
     for lane in range(LANES):
         if second.on[lane] != 0:

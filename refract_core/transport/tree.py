@@ -65,6 +65,8 @@ class Cell(NamedTuple):
     """of the pixel, or corner, whose sampling sequence a view ray follows"""
     y: I32_1D
     sample: I32_1D
+    spread: F64_1D
+    """growth of a view ray's cone per metre along it; set before it starts"""
     color: F64_2D
     """shape (N, 3)"""
     missing: F64_1D
@@ -202,7 +204,7 @@ def follow(
     """Follow the `count` rays on the stack, and what becomes of them, to their leaves, and ask those.
 
     Args:
-        view: whose rays they are; its spread is theirs.
+        view: whose rays they are.
         alone: draw what is opaque and seen without any glass, too; otherwise somebody else has drawn that.
         times: rays that a strong leaf sends to each light and to the sky.
     """
@@ -304,9 +306,8 @@ def _meet_all(scratch: TreeScratch, world: World, view: View, rules: Rules, take
             continue
         first = now.side[lane] == VIEW
         direction = row(now.direction, lane)
-        at = interaction(
-            world.geometry, hit, Ray(row(now.origin, lane), direction), view.spread * (now.travelled[lane] + hit.t)
-        )
+        wide = cell.spread[now.pixel[lane]] * (now.travelled[lane] + hit.t)
+        at = interaction(world.geometry, hit, Ray(row(now.origin, lane), direction), wide)
         meet(meeting, lane, now, at, world, rules)
         scratch.state[lane] = _MET
         if meeting.kind[lane] == PASSED:
@@ -436,7 +437,7 @@ def _load_query(
     query.blur[lane] = leaves.blur[k]
     query.roughness[lane] = leaves.roughness[k]
     query.thing[lane] = leaves.thing[k]
-    query.width[lane] = view.spread * (leaves.travelled[k] + scratch.leaf_hits.t[k])
+    query.width[lane] = cell.spread[i] * (leaves.travelled[k] + scratch.leaf_hits.t[k])
     keep_hit(query.met, lane, kept_hit(scratch.leaf_hits, k))
     inside = leaves.media.depth[k] > 0 and seen
     query.direct[lane] = 1 if direct else 0

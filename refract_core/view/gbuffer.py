@@ -75,6 +75,8 @@ class OpaqueLayer(NamedTuple):
     """shape (H, W, 3): diffuse light that arrives there"""
     gloss: F32_3D
     """shape (H, W, 3): radiance that is neither emitted nor diffuse: highlights and what is mirrored"""
+    seen: F32_3D
+    """shape (H, W, 2): share of the lamps' light and of the sky's that arrives, 0 .. 1; (0, 0, 2) where nobody asks"""
     glass: U8_2D
     """shape (H, W): 1 where the camera's ray meets glass first"""
     hits: PictureHits

@@ -44,6 +44,7 @@ class ScreenBuffers(NamedTuple):
     irradiance: F32_3D
     """shape (H, W, 3): as `gbuffer.OpaqueLayer`; so is the next"""
     gloss: F32_3D
+    seen: F32_3D
 
 
 class Screen(NamedTuple):
@@ -58,6 +59,7 @@ class Screen(NamedTuple):
     normal: F32_3D
     irradiance: F32_3D
     gloss: F32_3D
+    seen: F32_3D
 
 
 class BlurScratch(NamedTuple):
@@ -88,8 +90,8 @@ def depth_levels(width: int, height: int) -> Levels:
     return np.array(levels, np.int64)
 
 
-def new_screen_buffers(w: int, h: int, blurred: bool) -> ScreenBuffers:
-    """Empty pools of the right size; the opaque layer is drawn straight into their level 0."""
+def new_screen_buffers(w: int, h: int, blurred: bool, quiet: bool = False) -> ScreenBuffers:
+    """Empty pools of the right size; the opaque layer is drawn straight into their level 0. `quiet`: with shares."""
     colors, depths = color_levels(w, h, blurred), depth_levels(w, h)
 
     def total(levels: Levels) -> int:
@@ -101,7 +103,10 @@ def new_screen_buffers(w: int, h: int, blurred: bool) -> ScreenBuffers:
         np.zeros(total(depths), np.float32),
         np.zeros(total(depths), np.float32),
         depths,
-        *(np.zeros((h, w, 3), np.float32) for _ in range(3)),
+        np.zeros((h, w, 3), np.float32),
+        np.zeros((h, w, 3), np.float32),
+        np.zeros((h, w, 3), np.float32),
+        np.zeros((h, w, 2) if quiet else (0, 0, 2), np.float32),
     )
 
 

@@ -24,6 +24,7 @@ from ..kernels.sampling import Key, set_key
 from ..kernels.vec import dot, length, row, sub
 from ..world.embree import COHERENT, EVERYTHING, OPAQUE, clear, has_hit
 from ..world.shading import (
+    LOBES,
     Block,
     add_light,
     add_light_ray,
@@ -47,9 +48,9 @@ SIDE = 64
 _MARGIN = 2
 """Pixels around it whose finders' rays matter; the last cells need one, too."""
 _SPAN = SIDE + 1 + 2 * _MARGIN
-_CELL = 16
+_CELL = 8
 """Pixels between the nodes of the largest cells."""
-_LEVELS = 4
+_LEVELS = 3
 _ALIKE = 0.95
 """Cosine of normals between which light is interpolated."""
 _FLAT = 0.1
@@ -66,6 +67,10 @@ class QuietScratch(NamedTuple):
     """N rows: their surfaces, and the light that has been found for them"""
     part: I32_1D
     """shape (N,): Embree geometry; -1 where there is nothing"""
+    arrives: F64_1D
+    """shape (N,): irradiance from the lamps, as the sum of its colours"""
+    possible: F64_1D
+    """shape (N,): the same if nothing stood before them"""
     found: F64_1D
     """shape (N,): what the finder's ray says, 1 or 0; -1 where the light would bring nothing"""
     rays: I32_1D
@@ -85,7 +90,7 @@ class QuietScratch(NamedTuple):
         count = _SPAN * _SPAN
         return QuietScratch(
             new_lanes(ViewScratch), new_lanes(Block, count), np.zeros(count, np.int32), np.zeros(count),
-            np.zeros(count, np.int32), np.zeros(count), np.zeros((64, 4), np.int32),
+            np.zeros(count), np.zeros(count), np.zeros(count, np.int32), np.zeros(count), np.zeros((64, 4), np.int32),
             np.zeros(LANES), np.zeros(LANES),
         )  # fmt: skip
 
@@ -119,7 +124,7 @@ def quiet_tile(
                 if scratch.part[i] >= 0:
                     scratch.places.sky_seen[i] = scratch.open[i]
                     add_sky(scratch.places, i, world.environment)
-    _send(scratch, world, view, layer, x0, y0, x1, y1)
+    _send(scratch, world, view, care, layer, x0, y0, x1, y1)
     return packet.tally[0], glass
 
 
@@ -172,6 +177,7 @@ def _look(
                 i = _place(x - x0, y - y0)
                 copy_lane(places, i, block, lane)
                 forget_light(places, i)
+                scratch.possible[i] = scratch.arrives[i] = 0.0
                 scratch.part[i] = hit_in(packet, lane, world.geometry).part
     return glass
 
@@ -213,6 +219,10 @@ def _light(
             if shadows and _in_doubt(scratch, i):
                 places.lamp_seen[i] = _share_of_lamp(scratch, world, care.rays, l, i, x, y)
             add_light(places, i, lights, l)
+            radiance = row(lights.radiance, l)
+            possible = (radiance[0] + radiance[1] + radiance[2]) * places.lamp_diffuse[i]
+            scratch.possible[i] += possible
+            scratch.arrives[i] += possible * places.lamp_seen[i]
 
 
 @inlined
@@ -278,7 +288,7 @@ def _share_of_lamp(scratch: QuietScratch, world: World, rays: int, l: int, i: in
 def _find_sky(
     scratch: QuietScratch, world: World, view: View, care: Care, x0: int, y0: int, x1: int, y1: int
 ) -> None:
-    """The share of the sky that every place of the tile sees: cells of 16x16 pixels, cut in four where they must be."""
+    """The share of the sky that every place of the tile sees: cells of 8x8 pixels, cut in four where they must be."""
     for k in range(_SPAN * _SPAN):
         scratch.rays[k] = 0
     last_x, last_y = min(x1, view.size[0] - 1), min(y1, view.size[1] - 1)
@@ -383,7 +393,7 @@ def _node(scratch: QuietScratch, world: World, care: Care, i: int, j: int, x0: i
 
 @inlined
 def _send(
-    scratch: QuietScratch, world: World, view: View, layer: OpaqueLayer, x0: int, y0: int, x1: int, y1: int
+    scratch: QuietScratch, world: World, view: View, care: Care, layer: OpaqueLayer, x0: int, y0: int, x1: int, y1: int
 ) -> None:
     """Let every place send back what arrives, and write the picture."""
     looking = scratch.looking
@@ -397,5 +407,20 @@ def _send(
                 set_key(block.key, lane, Key(x, y, 0, 0))
                 if x < x1 and y < y1 and scratch.part[_place(x - x0, y - y0)] >= 0:
                     copy_lane(block, lane, scratch.places, _place(x - x0, y - y0))
+                    block.lobes[lane] = max(1, care.rays // LOBES)
             send_back(block, looking.second, packet, world, OPAQUE)
             write_opaque(layer, block, world, view, bx, by)
+            _keep_shares(scratch, layer, bx, by, x0, y0, x1, y1)
+
+
+@inlined
+def _keep_shares(
+    scratch: QuietScratch, layer: OpaqueLayer, bx: int, by: int, x0: int, y0: int, x1: int, y1: int
+) -> None:
+    """Note what part of the light arrives, for those who look at the place from elsewhere."""
+    for lane in range(LANES):
+        x, y = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
+        if x < x1 and y < y1:
+            i = _place(x - x0, y - y0)
+            layer.seen[y, x, 0] = scratch.arrives[i] / scratch.possible[i] if scratch.possible[i] > 0.0 else 1.0
+            layer.seen[y, x, 1] = scratch.places.sky_seen[i]

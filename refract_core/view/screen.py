@@ -61,9 +61,12 @@ class SeenLight(NamedTuple):
     irradiance: Vec
     gloss: Vec
     """highlights and what is mirrored, as the eye sees it"""
+    lamps: float
+    """share of their light that arrives, where that is known; so is the next"""
+    sky: float
 
 
-_DARK = SeenLight(False, 0.0, 0.0, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+_DARK = SeenLight(False, 0.0, 0.0, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, 0.0)
 
 
 class ScreenLight(NamedTuple):
@@ -243,8 +246,8 @@ def light_seen(screen: Screen, point: Vec, facing: Vec, agreeing: bool) -> SeenL
     Args:
         point: where the ray meets the surface [m].
         facing: unit geometric normal there, on the ray's side.
-        agreeing: only where the pixels agree about it. If it is noisy that must not be asked: it would favour the
-            brightest and the darkest.
+        agreeing: only where the pixels agree about it, and with the shares that arrive. If it is noisy that must not
+            be asked: it would favour the brightest and the darkest.
     """
     width, height = int(screen.camera.size[0]), int(screen.camera.size[1])
     px, py, z = project(screen.camera, point)
@@ -253,6 +256,7 @@ def light_seen(screen: Screen, point: Vec, facing: Vec, agreeing: bool) -> SeenL
         return _DARK
     x0, y0 = math.floor(x), math.floor(y)
     total, low, high = 0.0, math.inf, 0.0
+    lamps = sky = 0.0
     irradiance, gloss = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     for k in range(4):
         ix, iy = x0 + k % 2, y0 + k // 2
@@ -268,9 +272,13 @@ def light_seen(screen: Screen, point: Vec, facing: Vec, agreeing: bool) -> SeenL
         irradiance = along(irradiance, light, w)
         low, high = min(low, light[0] + light[1] + light[2]), max(high, light[0] + light[1] + light[2])
         gloss = along(gloss, row(screen.gloss[iy], ix), w)
+        if agreeing:
+            lamps += w * screen.seen[iy, ix, 0]
+            sky += w * screen.seen[iy, ix, 1]
     if total < 0.5 or (agreeing and high - low > _AGREE * high):
         return _DARK
-    return SeenLight(True, px, py, z, scale(irradiance, 1.0 / total), scale(gloss, 1.0 / total))
+    irradiance, gloss = scale(irradiance, 1.0 / total), scale(gloss, 1.0 / total)
+    return SeenLight(True, px, py, z, irradiance, gloss, lamps / total, sky / total)
 
 
 @inlined

@@ -31,6 +31,8 @@ _POLISHED_ROUGHNESS = 0.2
 take their reflection from the environment map alone."""
 _COAT_F0 = 0.04  # a clear coat of ior 1.5 (UsdPreviewSurface)
 _COSINE_CANDIDATES = 2
+LOBES = 4
+"""Rays to a light for each ray of a rough mirror: what it sees is lit by one more."""
 
 
 class Block(NamedTuple):
@@ -68,6 +70,8 @@ class Block(NamedTuple):
     """1 where diffuse light is asked for; 0 leaves `diffuse` at nothing, and saves its shadow rays"""
     rays: Words
     """that go to each light and to the sky; 1, unless somebody wants more"""
+    lobes: Words
+    """rays that a rough mirror sends; likewise"""
     distance: Scalars
     """hit distance [m]; inf where nothing was hit"""
 
@@ -98,8 +102,8 @@ class Block(NamedTuple):
     """1 where nothing stands before one point of it, or of the sky"""
 
     # Within `shade`, for the mirror bounce.
-    bounced: Flags
-    """1 where a mirror ray was sent"""
+    bounced: Words
+    """mirror rays that are sent"""
     bounce: Vectors
     """its unit direction, needed after the packet has been used again"""
     bounce_end: Scalars
@@ -159,7 +163,7 @@ def load_surface(block: Block, lane: int, at: Interaction, world: World, wo: Vec
     block.coat[lane] = share_input(world, at, Param.CLEARCOAT.value)
     block.coat_roughness[lane] = share_input(world, at, Param.CLEARCOAT_ROUGHNESS.value)
     block.occlusion[lane] = share_input(world, at, Param.OCCLUSION.value)
-    block.matte[lane] = block.rays[lane] = 1
+    block.matte[lane] = block.rays[lane] = block.lobes[lane] = 1
 
 
 @inlined
@@ -439,6 +443,32 @@ def _add_gloss_of_sky(block: Block, lane: int, world: World, f0: Vec, roughness:
 
 
 @inlined
+def gloss(block: Block, lane: int, world: World, lamps: float, sky: float) -> Vec:
+    """Highlights and what is mirrored of the sky, of a surface that mirrors nothing else, where the shares of lamps and
+    sky that arrive are known. The light that has been gathered is lost."""
+    lights = world.lights
+    forget_light(block, lane)
+    block.matte[lane] = 0
+    for l in range(lights.kind.shape[0]):  # noqa: E741
+        if aim_light(block, lane, lights, l):
+            block.lamp_seen[lane] = lamps if lights.casts_shadow[l] != 0 else 1.0
+            add_light(block, lane, lights, l)
+    put(block.color, lane, row(block.specular, lane))
+    block.sky_seen[lane] = sky
+    _add_gloss_of_sky(block, lane, world, row(block.f0, lane), block.roughness[lane], 1.0)
+    _add_coat_of_sky(block, lane, world)
+    return row(block.color, lane)
+
+
+@inlined
+def _add_coat_of_sky(block: Block, lane: int, world: World) -> None:
+    """Add what a clear coat mirrors of the sky."""
+    if block.coat[lane] > 0.0:
+        coat = (_COAT_F0, _COAT_F0, _COAT_F0)
+        _add_gloss_of_sky(block, lane, world, coat, block.coat_roughness[lane], block.coat[lane])
+
+
+@inlined
 def _reflects_the_scene(f0: Vec, roughness: float) -> bool:
     """The surface is smooth and strong enough for a mirror ray of its own."""
     strength = max(f0[0], f0[1], f0[2])
@@ -460,8 +490,7 @@ def shade(block: Block, second: Block, packet: Packet, world: World, mask: int) 
 def send_back(block: Block, second: Block, packet: Packet, world: World, mask: int) -> None:
     """The rest of `shade`, once the light has been gathered."""
     _add_matt(block)
-    clear(packet)
-    some = False
+    most = 0
     for lane in range(LANES):
         block.bounced[lane] = 0
         block.bounce_end[lane] = math.inf
@@ -469,28 +498,33 @@ def send_back(block: Block, second: Block, packet: Packet, world: World, mask: i
             continue
         f0, roughness = row(block.f0, lane), block.roughness[lane]
         if _reflects_the_scene(f0, roughness):
-            some = True
-            _add_mirror_ray(block, lane, packet, mask)
+            if roughness**2 <= MIRROR_ALPHA:
+                block.lobes[lane] = 1
+            block.bounced[lane] = block.lobes[lane]
+            most = max(most, block.lobes[lane])
         else:
             _add_gloss_of_sky(block, lane, world, f0, roughness, 1.0)
-        if block.coat[lane] > 0.0:
-            _add_gloss_of_sky(block, lane, world, (_COAT_F0, _COAT_F0, _COAT_F0), block.coat_roughness[lane],
-                              block.coat[lane])  # fmt: skip
-    if some:
-        _add_mirrored(block, second, packet, world, mask)
+        _add_coat_of_sky(block, lane, world)
+    for k in range(most):
+        _add_mirrored(block, second, packet, world, mask, k)
 
 
 @inlined
-def _add_mirrored(block: Block, second: Block, packet: Packet, world: World, mask: int) -> None:
-    """Trace the mirror rays in the packet, and add what they see. It is lit, but mirrors nothing itself any more."""
+def _add_mirrored(block: Block, second: Block, packet: Packet, world: World, mask: int, k: int) -> None:
+    """Send mirror ray `k` of every hit that has so many, and add what it sees: lit, but without mirrors of its own."""
+    clear(packet)
     for lane in range(LANES):
-        set_key(second.key, lane, branched(key_of(block.key, lane), MIRRORED))
+        if k >= block.bounced[lane]:
+            continue
+        key = nth(key_of(block.key, lane), k, block.bounced[lane])
+        set_key(second.key, lane, branched(key, MIRRORED))
+        _add_mirror_ray(block, lane, packet, mask, key)
     intersect_world(packet, world, block.bounce_end, SCATTERED)
     load_hits(second, packet, world, 0.0)
     gather(second, packet, world, mask)
     _add_matt(second)
     for lane in range(LANES):
-        if block.bounced[lane] == 0:
+        if k >= block.bounced[lane]:
             continue
         if second.on[lane] != 0:
             _add_gloss_of_sky(second, lane, world, row(second.f0, lane), second.roughness[lane], 1.0)
@@ -501,17 +535,18 @@ def _add_mirrored(block: Block, second: Block, packet: Packet, world: World, mas
             continue
         cosine = min(1.0, max(1e-3, dot(row(block.ns, lane), row(block.wo, lane))))
         reflectance = specular_albedo(row(block.f0, lane), block.roughness[lane], cosine)
-        put(block.color, lane, add(row(block.color, lane), mul(light, reflectance)))
+        light = scale(mul(light, reflectance), 1.0 / block.bounced[lane])
+        put(block.color, lane, add(row(block.color, lane), light))
 
 
 @inlined
-def _add_mirror_ray(block: Block, lane: int, packet: Packet, mask: int) -> None:
+def _add_mirror_ray(block: Block, lane: int, packet: Packet, mask: int, key: Key) -> None:
     """Put the mirror ray of a hit into the packet: about one microfacet of its lobe where it is not quite smooth."""
     n, wo = row(block.ns, lane), row(block.wo, lane)
     alpha = block.roughness[lane] ** 2
     h = n
     if alpha > MIRROR_ALPHA:
-        u1, u2 = unit_pair(key_of(block.key, lane), Purpose.MIRROR.value)
+        u1, u2 = unit_pair(key, Purpose.MIRROR.value)
         h = sample_half_vector(n, wo, alpha, u1, u2)
     r = normalize(sub(scale(h, 2.0 * dot(h, wo)), wo))
     ng = row(block.ng, lane)
@@ -519,5 +554,4 @@ def _add_mirror_ray(block: Block, lane: int, packet: Packet, mask: int) -> None:
     if below < 0.0:  # a shading normal may send it into its own surface; there it is thrown back once more
         r = normalize(sub(r, scale(ng, 2.0 * below)))
     set_ray(packet, lane, off_surface(row(block.point, lane), ng, r), r, 0.0, math.inf, mask)
-    block.bounced[lane] = 1
     put(block.bounce, lane, ray_direction(packet, lane))
