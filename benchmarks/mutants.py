@@ -25,6 +25,7 @@ from typing import NamedTuple
 ROOT = Path(__file__).parents[1]
 ORACLE = "tests/test_oracle.py"
 LAWS = "tests/test_render_laws.py"
+CORNERS = ("tests/test_corners.py",)
 TREE = "tests/test_tree.py"
 SCREEN = (TREE, LAWS, "tests/test_screen.py", "tests/test_shading.py", "tests/test_nothing_invented.py")
 COPIED = (
@@ -123,7 +124,7 @@ MUTANTS = (
            "if dot(row(leaves.direction, k), row(view.axes, 2)) > 0.0:",
            "if dot(row(leaves.direction, k), row(view.axes, 2)) > -2.0:"),
     Mutant("what is in the glass is asked like the rest", "transport/tree.py",
-           "query.embedded[lane] = 1 if inside else 0", "query.embedded[lane] = 0"),
+           "query.embedded[lane] = 1 if inside or direct else 0", "query.embedded[lane] = 1 if direct else 0"),
     Mutant("a lost ray is sure", "transport/tree.py", "if not is_lost(leaves, k):", "if leaves.met[k] >= 0:"),
     Mutant("tiers share absorbed light", "transport/tree.py",
            "cell.tiers[i, tier] += share *", "cell.tiers[i, tier] += mean *"),
@@ -132,15 +133,16 @@ MUTANTS = (
     Mutant("only the first surface of glass shines", "transport/tree.py",
            "if meeting.kind[lane] != LEFT and (meeting", "if first and meeting.kind[lane] != LEFT and (meeting"),
     Mutant("the colour of the first surface is reflection", "transport/tree.py",
-           "+= gloss if side == VIEW else gloss + body", "+= gloss + body"),
+           "_glow(scratch, i, body, side,", "_glow(scratch, i, body, MIRRORED_SIDE if side == VIEW else side,"),
     Mutant("the depth of glass is a distance", "transport/tree.py",
-           "cell.z_depth[i] = hit.t * dot(direction, row(view.axes, 2))", "cell.z_depth[i] = hit.t"),
+           "cell.z_depth[i] = hit.t * dot(direction, row(view.axes, 2))\n            cell.th",
+           "cell.z_depth[i] = hit.t\n            cell.th"),
     # --- the picture as a tier
     Mutant("the picture lights what lies in no plane of its own", "view/screen.py",
            "> _COPLANAR * z:", "> 1e9 * z:", SCREEN),
     Mutant("the picture lights what faces elsewhere", "view/screen.py", "facing) < _ALIKE:", "facing) < -2.0:", SCREEN),
     Mutant("a quarter of a pixel's weight is enough", "view/screen.py",
-           "    if total < 0.5:\n", "    if total <= 0.0:\n", SCREEN),
+           "    if total < 0.5 or", "    if total <= 0.0 or", SCREEN),
     Mutant("half known light is half the light", "view/screen.py",
            "scale(irradiance, 1.0 / total)", "scale(irradiance, 1.0)", SCREEN),
     Mutant("the picture lights mirrors", "transport/tiers.py",
@@ -202,6 +204,25 @@ MUTANTS = (
            "table.multiplier[k])", "1.0)", ("tests/test_probes.py", "tests/test_probe_laws.py")),
     Mutant("rough rays of the ray tier go straight", "transport/tiers.py",
            "if query.blur[lane] > 0.0:", "if query.blur[lane] > 100.0:"),
+    # --- pixels from corners, and quiet light
+    Mutant("corners stand in the middles of pixels", "view/camera.py",
+           "dx, dy = 0.5 * (right", "dx, dy = 0.0 * (right", CORNERS),
+    Mutant("what one corner alone sees counts for two", "transport/corners.py",
+           "color = add(color, scale(light, 0.25))", "color = add(color, scale(light, 0.5))", CORNERS),
+    Mutant("a texture goes on askew beyond its triangle", "transport/corners.py",
+           "px, py = dot(off, x), dot(off, y)", "px, py = dot(off, y), dot(off, x)", CORNERS),
+    Mutant("few samples of an edge count like many", "transport/corners.py",
+           "place, refining.samples / (end - first)", "place, 1.0", CORNERS),
+    Mutant("an edge of alpha alone is none", "transport/corners.py",
+           "return max(most, all_missing - least)", "return most", CORNERS),
+    Mutant("a leaf too many is forgotten", "transport/answers.py",
+           "min(k + 1, MOST_ANSWERS + 1)", "min(k + 1, MOST_ANSWERS)", CORNERS),
+    Mutant("what a probe has said is taken for the surface's", "transport/answers.py",
+           "query.color[lane, c] - share * known", "query.color[lane, c] - known", CORNERS),
+    Mutant("nobody doubts a lamp", "view/quiet.py",
+           "scratch.found[j] != scratch.found[i]:", "scratch.found[j] > 1.0:", CORNERS),
+    Mutant("any cell of the sky is filled", "view/quiet.py",
+           "if high - low > care.step:", "if high - low > 2.0:", CORNERS),
 )  # fmt: skip
 
 
