@@ -543,11 +543,11 @@ def test_it_is_off_by_less_than_its_tolerance_and_by_less_with_more_time(name: s
 
 
 def test_a_corner_with_more_leaves_than_are_kept_loses_none_of_its_light() -> None:
-    """White furnace: balls in balls' light, followed to a ten-thousandth, in a room of one radiance."""
+    """White furnace: balls in balls' light, of dense glass, followed to a last part in 100 000."""
     walls, materials = constant_room(0.75)
     balls = [replace(ball, material=1) for ball in BOWLS]
-    what = scene(walls, [*materials, CLEAR], balls)
-    picture = draw(what, 16, 16, **GOOD, cut=1e-4, max_layers=32)
+    what = scene(walls, [*materials, glass(Model.TRACED, 2.4)], balls)
+    picture = draw(what, 16, 16, **GOOD, cut=1e-5, max_layers=32)
     assert picture["mask"].mean() > 0.1
     np.testing.assert_allclose(picture["beauty"][..., :3], 0.75, atol=1e-4)
 
