@@ -25,6 +25,7 @@ from typing import NamedTuple
 ROOT = Path(__file__).parents[1]
 ORACLE = "tests/test_oracle.py"
 LAWS = "tests/test_render_laws.py"
+CORNERS = ("tests/test_corners.py",)
 TREE = "tests/test_tree.py"
 SCREEN = (TREE, LAWS, "tests/test_screen.py", "tests/test_shading.py", "tests/test_nothing_invented.py")
 COPIED = (
@@ -203,6 +204,25 @@ MUTANTS = (
            "table.multiplier[k])", "1.0)", ("tests/test_probes.py", "tests/test_probe_laws.py")),
     Mutant("rough rays of the ray tier go straight", "transport/tiers.py",
            "if query.blur[lane] > 0.0:", "if query.blur[lane] > 100.0:"),
+    # --- pixels from corners, and quiet light
+    Mutant("corners stand in the middles of pixels", "view/camera.py",
+           "dx, dy = 0.5 * (right", "dx, dy = 0.0 * (right", CORNERS),
+    Mutant("what one corner alone sees counts for two", "transport/corners.py",
+           "color = add(color, scale(light, 0.25))", "color = add(color, scale(light, 0.5))", CORNERS),
+    Mutant("a texture goes on askew beyond its triangle", "transport/corners.py",
+           "px, py = dot(off, x), dot(off, y)", "px, py = dot(off, y), dot(off, x)", CORNERS),
+    Mutant("few samples of an edge count like many", "transport/corners.py",
+           "place, refining.samples / (end - first)", "place, 1.0", CORNERS),
+    Mutant("an edge of alpha alone is none", "transport/corners.py",
+           "return max(most, all_missing - least)", "return most", CORNERS),
+    Mutant("a leaf too many is forgotten", "transport/answers.py",
+           "min(k + 1, MOST_ANSWERS + 1)", "min(k + 1, MOST_ANSWERS)", CORNERS),
+    Mutant("what a probe has said is taken for the surface's", "transport/answers.py",
+           "query.color[lane, c] - share * known", "query.color[lane, c] - known", CORNERS),
+    Mutant("nobody doubts a lamp", "view/quiet.py",
+           "scratch.found[j] != scratch.found[i]:", "scratch.found[j] > 1.0:", CORNERS),
+    Mutant("any cell of the sky is filled", "view/quiet.py",
+           "if high - low > care.step:", "if high - low > 2.0:", CORNERS),
 )  # fmt: skip
 
 
