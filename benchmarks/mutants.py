@@ -148,7 +148,7 @@ MUTANTS = (
     Mutant("the picture lights mirrors", "transport/tiers.py",
            "world.materials.gleams[hit.material] != 0", "world.materials.gleams[hit.material] > 1", SCREEN),
     Mutant("the picture's highlights get lost", "transport/tiers.py",
-           "row(surface.emissive, lane), lit), seen.gloss)", "row(surface.emissive, lane), lit), lit)", SCREEN),
+           "    gleam = seen.gloss\n", "    gleam = lit\n", SCREEN),
     # --- the surface
     Mutant("clear coat doubled", "world/shading.py", "fc = coat * (", "fc = 2.0 * coat * ("),
     Mutant("occlusion ignored", "world/shading.py",

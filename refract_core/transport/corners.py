@@ -491,7 +491,7 @@ def _draw_edges(
         for place in range(first, end):
             own.places[count], own.times[count] = place, refining.samples / (end - first)
             px, py = x + 0.5 + refining.offsets[place, 0], y + 0.5 + refining.offsets[place, 1]
-            scratch.cell.spread[count] = view.spread / math.sqrt(end - first)
+            scratch.cell.spread[count] = view.spread / math.sqrt(refining.samples)
             count = start(scratch, view, view_ray, count, count, px, py, Key(x, y, 0, place - first))
             if count == CELL:
                 _draw_samples(scratch, own, world, asking, rules, refining, view, planes, count)

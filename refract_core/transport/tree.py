@@ -206,7 +206,7 @@ def follow(
     Args:
         view: whose rays they are.
         alone: draw what is opaque and seen without any glass, too; otherwise somebody else has drawn that.
-        times: rays that a strong leaf sends to each light and to the sky.
+        times: rays that a strong leaf sends to each light and to the sky, or into its cone; weak ones send fewer.
     """
     stack = scratch.stack
     leaves = 0
@@ -444,7 +444,7 @@ def _load_query(
     query.embedded[lane] = 1 if inside or direct else 0
     strongest = max(leaves.weight[k, 0], leaves.weight[k, 1], leaves.weight[k, 2])
     query.strong[lane] = 1 if strongest > _STRONG else 0
-    query.rays[lane] = times if strongest > _STRONG else 1
+    query.rays[lane] = max(1, math.ceil(times * min(1.0, strongest / _STRONG)))
     query.by_proxy[lane] = 1 if asking.method == PROXY and leaves.side[k] != MIRRORED_SIDE else 0
 
 
