@@ -96,13 +96,14 @@ def add_answer(answers: Answers, slot: int, leaves: Rays, k: int, query: Query, 
     hit = kept_hit(query.met, lane)
     keep_hit(answers.hits, r, hit)
     d = row(leaves.direction, k)
-    answers.way[r] = np.int32(hash32(leaves.way[k], hit.part, 0))
+    sharp = query.blur[lane] <= 0.0  # the ray in the middle of a cone says nothing about the rest of it
+    answers.way[r] = np.int32(hash32(leaves.way[k], hit.part if sharp else NOTHING, 0))
     answers.side[r] = max(THROUGH_SIDE, leaves.side[k])  # what an eye in glass sees has come through, too
     put(answers.weight, r, row(leaves.weight, k))
     put(answers.direction, r, d)
     put(answers.point, r, d)
     put(answers.normal, r, d)
-    if hit.part != NOTHING:
+    if sharp and hit.part != NOTHING:
         at = interaction(world.geometry, hit, Ray(row(leaves.origin, k), d), 0.0)
         put(answers.point, r, at.point)
         put(answers.normal, r, flip_towards(at.ng, scale(d, -1.0)))

@@ -235,9 +235,12 @@ def _ask_screen_traced(query: Query, lane: int, asking: Asking, work: TierScratc
     if hit.part == NOTHING:
         return
     sharp = query.blur[lane] <= 0.0
-    by_ray = query.strong[lane] != 0 and not asking.quiet
-    by_ray = by_ray or world.materials.gleams[hit.material] != 0 or not world.lit
-    if asking.traces and sharp and by_ray:
+    strong = query.strong[lane] != 0
+    if asking.traces and sharp:
+        by_ray = (strong and not asking.quiet) or world.materials.gleams[hit.material] != 0 or not world.lit
+    else:
+        by_ray = strong and asking.quiet
+    if asking.traces and by_ray:
         return
     screen, surface = asking.screen, work.second
     d = row(query.direction, lane)
