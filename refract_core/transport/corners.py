@@ -22,8 +22,8 @@ from ..kernels.vec import Vec, add, dot, length, lerp, mul, normalize, row, scal
 from ..view.camera import Tile, View, pixel_point, pixel_ray
 from ..view.gbuffer import OpaqueLayer
 from ..view.planes import Planes
-from ..world.shading import load_surface
-from ..world.surface import Hit, Ray, corners_of, interaction
+from ..world.shading import is_painted_alone, load_surface, paint
+from ..world.surface import Hit, Interaction, Ray, corners_of, interaction
 from ..world.tables import World
 from .answers import MOST_ANSWERS, Answers, add_direct, add_sky, body_light, hit_of, keep_answers
 from .crossing import Rules
@@ -364,6 +364,11 @@ def _filter(scratch: TreeScratch, own: CornerScratch, world: World) -> None:
     across, down = min(_MOST_TAPS, math.ceil(wide / step - 1e-6)), min(_MOST_TAPS, math.ceil(high / step - 1e-6))
     across, down = max(across, 2), max(down, 2)
     emissive, albedo = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    first = hit_of(answers, found[0])
+    alone = is_painted_alone(world, first.material)
+    if alone:  # what it mirrors is the same all over the pixel
+        wo = scale(row(answers.direction, found[0]), -1.0)
+        load_surface(block, 0, interaction(world.geometry, first, Ray(a, wo), 0.0), world, wo)
     for j in range(down):
         t = (j + 0.5) / down
         for i in range(across):
@@ -372,9 +377,12 @@ def _filter(scratch: TreeScratch, own: CornerScratch, world: World) -> None:
             near = found[(1 if s > 0.5 else 0) + (2 if t > 0.5 else 0)]
             hit = _moved(world, hit_of(answers, near), sub(p, row(answers.point, near)))
             wo = scale(row(answers.direction, near), -1.0)
-            at = interaction(world.geometry, hit, Ray(p, wo), _SHARPER * step)
-            load_surface(block, 0, at, world, wo)
-            emissive, albedo = add(emissive, row(block.emissive, 0)), add(albedo, row(block.albedo, 0))
+            if alone:
+                shines, sends = paint(block, 0, Interaction(hit, p, wo, wo, _SHARPER * step), world)
+            else:
+                load_surface(block, 0, interaction(world.geometry, hit, Ray(p, wo), _SHARPER * step), world, wo)
+                shines, sends = row(block.emissive, 0), row(block.albedo, 0)
+            emissive, albedo = add(emissive, shines), add(albedo, sends)
     put(own.filtered, 0, scale(emissive, 1.0 / (across * down)))
     put(own.filtered, 1, scale(albedo, 1.0 / (across * down)))
 

@@ -144,14 +144,7 @@ def load_surface(block: Block, lane: int, at: Interaction, world: World, wo: Vec
         dielectric = f0_from_ior(float_input(world, at, Param.IOR.value))
         f0 = lerp((dielectric, dielectric, dielectric), base, metallic)
     roughness = share_input(world, at, Param.ROUGHNESS.value)
-    # What the surface mirrors does not enter it: the diffuse part gets what the specular lobe leaves over.
-    sent_back = specular_albedo(f0, roughness, abs(dot(ns, wo)))
-    kept = scale(base, 1.0 - metallic)
-    diffuse = (
-        kept[0] * (1.0 - min(1.0, sent_back[0])),
-        kept[1] * (1.0 - min(1.0, sent_back[1])),
-        kept[2] * (1.0 - min(1.0, sent_back[2])),
-    )
+    diffuse = mul(scale(base, 1.0 - metallic), _entering(f0, roughness, abs(dot(ns, wo))))
     put(block.point, lane, at.point)
     put(block.ng, lane, ng)
     put(block.ns, lane, ns)
@@ -164,6 +157,34 @@ def load_surface(block: Block, lane: int, at: Interaction, world: World, wo: Vec
     block.coat_roughness[lane] = share_input(world, at, Param.CLEARCOAT_ROUGHNESS.value)
     block.occlusion[lane] = share_input(world, at, Param.OCCLUSION.value)
     block.matte[lane] = block.rays[lane] = block.lobes[lane] = 1
+
+
+@inlined
+def _entering(f0: Vec, roughness: float, cosine: float) -> Vec:
+    """What the surface mirrors does not enter it: the diffuse part gets what the specular lobe leaves over."""
+    sent_back = specular_albedo(f0, roughness, cosine)
+    return (1.0 - min(1.0, sent_back[0]), 1.0 - min(1.0, sent_back[1]), 1.0 - min(1.0, sent_back[2]))
+
+
+@inlined
+def is_painted_alone(world: World, m: int) -> bool:
+    """Textures and primvars drive no more of a material than its colours, which then say nothing of what it mirrors."""
+    materials = world.materials
+    colours = (1 << Param.DIFFUSE.value) | (1 << Param.EMISSIVE.value)
+    apart = materials.specular_workflow[m] != 0 or materials.value[m, Param.METALLIC.value, 0] == 0.0
+    return apart and materials.driven[m] & ~colours == 0
+
+
+@inlined
+def paint(block: Block, lane: int, at: Interaction, world: World) -> tuple[Vec, Vec]:
+    """Emission and albedo at another place of the surface in a lane, of a material that `is_painted_alone`."""
+    metallic = 0.0
+    if not world.materials.specular_workflow[at.hit.material]:
+        metallic = share_input(world, at, Param.METALLIC.value)
+    cosine = abs(dot(row(block.ns, lane), row(block.wo, lane)))
+    entering = _entering(row(block.f0, lane), block.roughness[lane], cosine)
+    base = scale(color_input(world, at, Param.DIFFUSE.value), 1.0 - metallic)
+    return color_input(world, at, Param.EMISSIVE.value), mul(base, entering)
 
 
 @inlined
