@@ -52,7 +52,9 @@ def test_every_attribute_is_explained_in_a_section_with_a_picture(attribute: str
 
 def test_each_picture_is_shown_once_and_none_lies_about() -> None:
     assert len(REFERENCED) == len(set(REFERENCED))
-    own = {name for name in REFERENCED if name.startswith("pictures/")}
+    charts = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", (DOCS / "performance.md").read_text("utf-8"))
+    assert len(charts) == len(set(charts))
+    own = {name for name in [*REFERENCED, *charts] if name.startswith("pictures/")}
     assert own == {f"pictures/{path.name}" for path in (DOCS / "pictures").iterdir()}
 
 
