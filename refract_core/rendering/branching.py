@@ -88,7 +88,7 @@ class Tree:
     def _corner_passes(self) -> Iterator[Pass]:
         settings, (width, height) = self.settings, self.size
         view = view_of(self.camera, width, height)
-        corners = corners_of(view_of(self.camera, width, height))
+        corners = corners_of(view)
         yield from self._quiet_passes(corners, 0.3)
         exposure = self.camera.exposure_scale * 2.0**settings.exposure
         few, rays = max(2, settings.samples // 4), settings.light_samples
@@ -113,9 +113,13 @@ class Tree:
         yield Pass(draw, tiles_of(width, height, PATCH), 0.7)
 
     def _sample_passes(self, view: View, sample: int, share: float) -> Iterator[Pass]:
-        yield from self._opaque_passes(view, sample, self.tiles, 0.3 * share)
-        world, asking = self.session.world, by_address(self._asking(view))
+        world, asking, camera = self.session.world, by_address(self._asking(view)), by_address(view)
         opaque, target = by_address(self.opaque), by_address(self.planes)
+
+        def look(tile: Tile) -> tuple[int, int]:
+            return opaque_tile(world, camera, scratch(ViewScratch), tile, sample, opaque)
+
+        yield from self._looking(look, self.tiles, 0.3 * share)
 
         def grow(tile: Tile) -> int:
             tree = scratch(TreeScratch)
@@ -124,36 +128,33 @@ class Tree:
         yield Pass(grow, self.tiles, 0.7 * share)
 
     def _quiet_passes(self, view: View, share: float) -> Iterator[Pass]:
-        """Draw the corners' picture without glass, and what the screen tier reads of it."""
+        """Draw the corners' picture without glass."""
         world, camera, opaque = self.session.world, by_address(view), by_address(self.opaque)
         rays = self.settings.light_samples
         step = max(_SKY_STEP * self.settings.tolerance, _SKY_NOISE / rays**0.75)
         care = by_address(Care(rays, min(0.5, step)))
         width, height = self.size
+
+        def look(tile: Tile) -> tuple[int, int]:
+            return quiet_tile(world, camera, scratch(QuietScratch), care, tile, opaque)
+
+        yield from self._looking(look, tiles_of(width + 1, height + 1, QUIET_SIDE), share)
+
+    def _looking(self, look: Callable[[Tile], tuple[int, int]], tiles: list[Tile], share: float) -> Iterator[Pass]:
+        """Draw the picture without glass, and what the screen tier reads of it.
+
+        Args:
+            look: draws a tile; returns rays traced, and pixels with glass before them.
+        """
         glassy: list[Tile] = []
 
-        def look(tile: Tile) -> int:
-            traced, glass = quiet_tile(world, camera, scratch(QuietScratch), care, tile, opaque)
+        def draw(tile: Tile) -> int:
+            rays, glass = look(tile)
             if glass:
                 glassy.append(tile)
-            return int(traced)
+            return rays
 
-        yield Pass(look, tiles_of(width + 1, height + 1, QUIET_SIDE), share)
-        if TIERS.index("screen") in self.order and glassy:
-            yield Pass(_without_rays, self._levels(), 0.0)
-
-    def _opaque_passes(self, view: View, sample: int, tiles: list[Tile], share: float) -> Iterator[Pass]:
-        """Draw the picture without glass, and what the screen tier reads of it."""
-        world, camera, opaque = self.session.world, by_address(view), by_address(self.opaque)
-        glassy: list[Tile] = []
-
-        def look(tile: Tile) -> int:
-            rays, glass = opaque_tile(world, camera, scratch(ViewScratch), tile, sample, opaque)
-            if glass:
-                glassy.append(tile)
-            return int(rays)
-
-        yield Pass(look, tiles, share)
+        yield Pass(draw, tiles, share)
         if TIERS.index("screen") in self.order and glassy:
             yield Pass(_without_rays, self._levels(), 0.0)
 

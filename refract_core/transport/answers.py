@@ -16,8 +16,7 @@ from ..kernels.compile import inlined
 from ..kernels.lanes import put
 from ..kernels.sampling import hash32
 from ..kernels.vec import Vec, flip_towards, mul, row, scale
-from ..world.shading import Block
-from ..world.surface import NOTHING, Hit, HitLanes, Interaction, Ray, interaction, keep_hit, kept_hit
+from ..world.surface import NOTHING, HitLanes, Interaction, Ray, interaction, keep_hit, kept_hit
 from ..world.tables import World
 from .rays import THROUGH_SIDE, VIEW, Rays
 from .tiers import Query
@@ -139,9 +138,9 @@ def add_glow(answers: Answers, slot: int, light: Vec, side: int, way: int, what:
 
 @inlined
 def add_direct(
-    answers: Answers, slot: int, at: Interaction, direction: Vec, block: Block, lane: int, irradiance: Vec, rest: Vec
+    answers: Answers, slot: int, at: Interaction, direction: Vec, emissive: Vec, albedo: Vec, irradiance: Vec, rest: Vec
 ) -> None:
-    """Keep an opaque surface that a view ray sees, whose material is in a lane of a block."""
+    """Keep an opaque surface that a view ray sees."""
     answers.filled[slot] = 1
     r = slot * MOST_ANSWERS
     keep_hit(answers.hits, r, at.hit)
@@ -150,8 +149,8 @@ def add_direct(
     put(answers.point, r, at.point)
     put(answers.direction, r, direction)
     put(answers.normal, r, flip_towards(at.ng, scale(direction, -1.0)))
-    put(answers.emissive, r, row(block.emissive, lane))
-    put(answers.albedo, r, row(block.albedo, lane))
+    put(answers.emissive, r, emissive)
+    put(answers.albedo, r, albedo)
     put(answers.irradiance, r, irradiance)
     put(answers.rest, r, rest)
 
@@ -182,9 +181,3 @@ def body_light(answers: Answers, r: int, emissive: Vec, albedo: Vec) -> Vec:
         rest[1] + share * (emissive[1] + lit[1]),
         rest[2] + share * (emissive[2] + lit[2]),
     )
-
-
-@inlined
-def hit_of(answers: Answers, r: int) -> Hit:
-    """What a leaf has met."""
-    return kept_hit(answers.hits, r)

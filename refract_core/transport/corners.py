@@ -23,12 +23,12 @@ from ..view.camera import Tile, View, pixel_point, pixel_ray
 from ..view.gbuffer import OpaqueLayer
 from ..view.planes import Planes
 from ..world.shading import is_painted_alone, load_surface, paint
-from ..world.surface import Hit, Interaction, Ray, corners_of, interaction
+from ..world.surface import Hit, Interaction, Ray, corners_of, interaction, kept_hit
 from ..world.tables import World
-from .answers import MOST_ANSWERS, Answers, add_direct, add_sky, body_light, hit_of, keep_answers
+from .answers import MOST_ANSWERS, Answers, add_direct, add_sky, body_light, keep_answers
 from .crossing import Rules
 from .pixels import add_glass, add_light, keep_glass, keep_place
-from .rays import MIRRORED_SIDE, THROUGH_SIDE, Rays
+from .rays import MIRRORED_SIDE, THROUGH_SIDE, VIEW, Rays
 from .tiers import Asking
 from .tree import CELL, SLOTS, Cell, TreeScratch, clear_slot, follow, start
 
@@ -48,8 +48,8 @@ _PER_TOLERANCE = 0.8
 """Samples, to the power of 3/4, for each tolerance that corners differ by."""
 _PAINTED = 0.2
 """Times the tolerance, below which a texture is not looked at between the corners."""
-_SMOOTH_PIXEL = -1
-"""That takes no set of samples."""
+_SMOOTH_PIXEL, _ALL_SAMPLES = -1, 2
+"""The set of samples of a pixel that takes none, and of one that takes all."""
 _EDGE_ON = 0.1
 """Cosine below which a surface is seen too slantingly to say where it is elsewhere."""
 _MOST_TAPS = 8
@@ -96,6 +96,8 @@ class CornerScratch(NamedTuple):
     """shape (4, 3): light that each corner alone has"""
     shared: F64_2D
     """shape (4, 3): light that all have, without what textures do to it"""
+    light: F64_2D
+    """shape (3, 3): what the pixel gets, by the side of the leaves"""
 
     @staticmethod
     def fresh() -> CornerScratch:
@@ -104,7 +106,7 @@ class CornerScratch(NamedTuple):
             np.zeros(PATCH * PATCH, np.int32), np.zeros(PATCH * PATCH, np.int32),
             np.zeros(CELL, np.int32), np.zeros(CELL),
             np.zeros(4, np.int64), np.zeros(4, np.int64),
-            np.zeros((2, 3)), np.zeros((4, 3)), np.zeros((4, 3)),
+            np.zeros((2, 3)), np.zeros((4, 3)), np.zeros((4, 3)), np.zeros((3, 3)),
         )  # fmt: skip
 
 
@@ -213,10 +215,9 @@ def _keep_opaque(
         np.float64(hits.u[y, x]), np.float64(hits.v[y, x]), t,
     )  # fmt: skip
     at = interaction(world.geometry, hit, Ray(origin, direction), view.spread * t)
-    block = scratch.block_of_one
-    load_surface(block, 0, at, world, scale(direction, -1.0))
+    emissive, albedo = row(hits.emissive[y], x), row(hits.albedo[y], x)
     irradiance, gloss = row(opaque.irradiance[y], x), row(opaque.gloss[y], x)
-    add_direct(scratch.answers, slot, at, direction, block, 0, irradiance, gloss)
+    add_direct(scratch.answers, slot, at, direction, emissive, albedo, irradiance, gloss)
 
 
 # --- a pixel ------------------------------------------------------------------------------------------------------
@@ -231,11 +232,12 @@ def _draw_pixel(
     answers = scratch.answers
     for k in range(4):
         if answers.filled[_corner(slot, k)] > MOST_ANSWERS:
-            return 2
+            return _ALL_SAMPLES
         own.used[k] = 0
         for c in range(3):
             own.alone[k, c] = own.shared[k, c] = 0.0
-    color, through, mirrored = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    for side in range(3):
+        put(own.light, side, (0.0, 0.0, 0.0))
     seen = (0.0, 0.0, 0.0)
     for k in range(4):
         seen = add(seen, scale(row(scratch.cell.color, _corner(slot, k)), 0.25))
@@ -244,11 +246,7 @@ def _draw_pixel(
         if not _match(answers, own, slot, r):
             continue
         light = _light_of_four(scratch, own, world, refining, seen)
-        color = add(color, light)
-        if answers.side[r] == THROUGH_SIDE:
-            through = add(through, light)
-        elif answers.side[r] == MIRRORED_SIDE:
-            mirrored = add(mirrored, light)
+        put(own.light, answers.side[r], add(row(own.light, answers.side[r]), light))
     for k in range(4):
         base = _corner(slot, k) * MOST_ANSWERS
         for n in range(answers.filled[_corner(slot, k)]):
@@ -258,15 +256,11 @@ def _draw_pixel(
             there = body_light(answers, r, row(answers.emissive, r), row(answers.albedo, r))
             light = mul(row(answers.weight, r), there)
             put(own.alone, k, add(row(own.alone, k), light))
-            color = add(color, scale(light, 0.25))
-            if answers.side[r] == THROUGH_SIDE:
-                through = add(through, scale(light, 0.25))
-            elif answers.side[r] == MIRRORED_SIDE:
-                mirrored = add(mirrored, scale(light, 0.25))
+            put(own.light, answers.side[r], add(row(own.light, answers.side[r]), scale(light, 0.25)))
     contrast = _contrast(scratch, own, refining, slot)
     if contrast > refining.tolerance:
         return _set_for(refining, contrast)
-    _write_pixel(scratch, planes, refining.samples, x, y, slot, color, through, mirrored, view.orthographic)
+    _write_pixel(scratch, own, planes, refining.samples, x, y, slot, view.orthographic)
     return _SMOOTH_PIXEL
 
 
@@ -336,7 +330,7 @@ def _is_painted(
     answers: Answers, found: I64_1D, world: World, weight: Vec, seen: Vec, refining: Refining
 ) -> bool:
     """A texture changes the light of four answers by so much that it has to be looked at between them."""
-    hit = hit_of(answers, found[0])
+    hit = kept_hit(answers.hits, found[0])
     if world.materials.driven[hit.material] == 0 or world.geometry.sphere[hit.part, 3] > 0.0:
         return False
     for c in range(3):
@@ -364,7 +358,7 @@ def _filter(scratch: TreeScratch, own: CornerScratch, world: World) -> None:
     across, down = min(_MOST_TAPS, math.ceil(wide / step - 1e-6)), min(_MOST_TAPS, math.ceil(high / step - 1e-6))
     across, down = max(across, 2), max(down, 2)
     emissive, albedo = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    first = hit_of(answers, found[0])
+    first = kept_hit(answers.hits, found[0])
     alone = is_painted_alone(world, first.material)
     if alone:  # what it mirrors is the same all over the pixel
         wo = scale(row(answers.direction, found[0]), -1.0)
@@ -375,7 +369,7 @@ def _filter(scratch: TreeScratch, own: CornerScratch, world: World) -> None:
             s = (i + 0.5) / across
             p = lerp(lerp(a, b, s), lerp(c, d, s), t)
             near = found[(1 if s > 0.5 else 0) + (2 if t > 0.5 else 0)]
-            hit = _moved(world, hit_of(answers, near), sub(p, row(answers.point, near)))
+            hit = _moved(world, kept_hit(answers.hits, near), sub(p, row(answers.point, near)))
             wo = scale(row(answers.direction, near), -1.0)
             if alone:
                 shines, sends = paint(block, 0, Interaction(hit, p, wo, wo, _SHARPER * step), world)
@@ -443,16 +437,16 @@ def _set_for(refining: Refining, contrast: float) -> int:
     stratified sampling in graphics", SIGGRAPH 1996).
     """
     enough = (_PER_TOLERANCE * contrast / refining.tolerance) ** (4.0 / 3.0)
-    for k in range(2):
+    for k in range(_ALL_SAMPLES):
         if refining.sets[k + 1] - refining.sets[k] >= enough:
             return k
-    return 2
+    return _ALL_SAMPLES
 
 
 @inlined
 def _write_pixel(
-    scratch: TreeScratch, planes: Planes, samples: int, x: int, y: int, slot: int,
-    color: Vec, through: Vec, mirrored: Vec, orthographic: bool,
+    scratch: TreeScratch, own: CornerScratch, planes: Planes, samples: int, x: int, y: int, slot: int,
+    orthographic: bool,
 ) -> None:  # fmt: skip
     """Write a pixel's light, and the mean of what else its corners know."""
     cell = scratch.cell
@@ -468,10 +462,11 @@ def _write_pixel(
             add_glass(planes, cell, i, x, y, 0.25 * samples)
             glass = i if glass < 0 else glass
     for c in range(3):
-        planes.beauty[y, x, c] = samples * color[c]
+        through, mirrored = own.light[THROUGH_SIDE, c], own.light[MIRRORED_SIDE, c]
+        planes.beauty[y, x, c] = samples * (own.light[VIEW, c] + through + mirrored)
         if glass >= 0:
-            planes.refraction[y, x, c] = samples * through[c]
-            planes.reflection[y, x, c] = samples * mirrored[c]
+            planes.refraction[y, x, c] = samples * through
+            planes.reflection[y, x, c] = samples * mirrored
     planes.beauty[y, x, 3] = samples * (1.0 - missing)
     if glass >= 0:
         keep_glass(planes, cell, glass, x, y)

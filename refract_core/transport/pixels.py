@@ -63,10 +63,11 @@ def _start_cell(
         i = block % (SIDE // BLOCK_WIDTH) * BLOCK_WIDTH + lane % BLOCK_WIDTH
         j = block // (SIDE // BLOCK_WIDTH) * BLOCK_HEIGHT + lane // BLOCK_WIDTH
         x, y, slot = x0 + i, y0 + j, j * SIDE + i
-        clear_slot(scratch.cell, slot)
         if x >= view.size[0] or y >= view.size[1]:
             continue
-        if opaque.glass[y, x] != 0 or view_ray.media.depth[0] > 0:
+        if opaque.glass[y, x] == 0 and view_ray.media.depth[0] == 0:
+            clear_slot(scratch.cell, slot)
+        else:
             scratch.cell.spread[slot] = view.spread
             count = start(scratch, view, view_ray, count, slot, x + 0.5, y + 0.5, Key(x, y, 0, sample))
     return count

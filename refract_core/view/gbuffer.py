@@ -53,12 +53,17 @@ class PictureHits(NamedTuple):
     """1 where it is there by chance, or something else is not"""
     u: F32_2D
     v: F32_2D
+    emissive: F32_3D
+    """shape (H, W, 3): radiance; this and the next filtered over the pixel's cone"""
+    albedo: F32_3D
+    """shape (H, W, 3)"""
 
 
 def new_hits(width: int, height: int) -> PictureHits:
     """Room for the hits of a picture."""
     words, numbers = np.zeros((5, height, width), np.int32), np.zeros((2, height, width), np.float32)
-    return PictureHits(words[0], words[1], words[2], words[3], words[4], numbers[0], numbers[1])
+    colors = np.zeros((2, height, width, 3), np.float32)
+    return PictureHits(*words, *numbers, *colors)
 
 
 class OpaqueLayer(NamedTuple):
@@ -76,7 +81,8 @@ class OpaqueLayer(NamedTuple):
     gloss: F32_3D
     """shape (H, W, 3): radiance that is neither emitted nor diffuse: highlights and what is mirrored"""
     seen: F32_3D
-    """shape (H, W, 2): share of the lamps' light and of the sky's that arrives, 0 .. 1; (0, 0, 2) where nobody asks"""
+    """shape (H, W, 4): share of the lamps' light, and of the sky's by colour, that arrives, 0 .. 1; (0, 0, 4) where
+    nobody asks"""
     glass: U8_2D
     """shape (H, W): 1 where the camera's ray meets glass first"""
     hits: PictureHits
@@ -132,8 +138,6 @@ def opaque_tile(
                     glass += 1
             if behind:
                 trace_behind_glass(scratch, world, view, x0, y0)
-            if layer.hits.part.shape[0] > 0:
-                keep_hits(layer.hits, packet, world, x0, y0, width, height)
             load_hits(block, packet, world, view.spread)
             shade(block, scratch.second, packet, world, OPAQUE)
             write_opaque(layer, block, world, view, x0, y0)
@@ -187,6 +191,9 @@ def write_opaque(layer: OpaqueLayer, block: Block, world: World, view: View, x0:
                 layer.normal[y, x, c] = block.ng[lane, c]
                 layer.irradiance[y, x, c] = block.diffuse[lane, c]
                 layer.gloss[y, x, c] = block.color[lane, c] - diffuse
+                if layer.hits.part.shape[0] > 0:
+                    layer.hits.emissive[y, x, c] = block.emissive[lane, c]
+                    layer.hits.albedo[y, x, c] = block.albedo[lane, c]
             layer.depth[y, x] = block.distance[lane] * cosine
             layer.color[y, x, 3] = 1.0
             continue
