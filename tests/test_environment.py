@@ -45,15 +45,15 @@ def _irradiance(table: env.EnvironmentTable, n: F64, out: F64) -> None:
 @kernel
 def _draw(table: env.EnvironmentTable, u: F64, out: F64) -> None:
     for i in range(u.shape[0]):
-        d, pdf = env.sample_direction(table, u[i, 0], u[i, 1])
+        d, pdf, _ = env.sample_direction(table, u[i, 0], u[i, 1])
         out[i, 0], out[i, 1], out[i, 2], out[i, 3] = d[0], d[1], d[2], pdf
-        out[i, 4] = env.direction_pdf(table, d)
+        out[i, 4], _ = env.direction_pdf(table, d)
 
 
 @kernel
 def _density(table: env.EnvironmentTable, d: F64, out: F64) -> None:
     for i in range(d.shape[0]):
-        out[i] = env.direction_pdf(table, (d[i, 0], d[i, 1], d[i, 2]))
+        out[i], _ = env.direction_pdf(table, (d[i, 0], d[i, 1], d[i, 2]))
 
 
 def radiance(table: env.EnvironmentTable, d: object, footprint: float = 0.0) -> F64:

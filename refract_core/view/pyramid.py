@@ -106,7 +106,7 @@ def new_screen_buffers(w: int, h: int, blurred: bool, quiet: bool = False) -> Sc
         np.zeros((h, w, 3), np.float32),
         np.zeros((h, w, 3), np.float32),
         np.zeros((h, w, 3), np.float32),
-        np.zeros((h, w, 2) if quiet else (0, 0, 2), np.float32),
+        np.zeros((h, w, 4) if quiet else (0, 0, 4), np.float32),
     )
 
 

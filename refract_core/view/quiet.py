@@ -17,11 +17,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..kernels.arrays import F64_1D, I32_1D, I32_2D
+from ..kernels.arrays import F64_1D, F64_2D, I32_1D, I32_2D
 from ..kernels.compile import inlined, kernel
-from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Scalars, new_lanes
+from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Scalars, Vectors, new_lanes, put
 from ..kernels.sampling import Key, set_key
-from ..kernels.vec import dot, length, row, sub
+from ..kernels.vec import Vec, add, along, dot, length, lerp, row, sub
 from ..world.embree import COHERENT, EVERYTHING, OPAQUE, clear, has_hit
 from ..world.shading import (
     LOBES,
@@ -36,6 +36,7 @@ from ..world.shading import (
     load_hits,
     nth,
     send_back,
+    share_of_sky,
 )
 from ..world.surface import hit_in
 from ..world.tables import World
@@ -75,13 +76,13 @@ class QuietScratch(NamedTuple):
     """shape (N,): what the finder's ray says, 1 or 0; -1 where the light would bring nothing"""
     rays: I32_1D
     """shape (N,): 1 where the share of the sky is known"""
-    open: F64_1D
-    """shape (N,): and that share"""
+    open: F64_2D
+    """shape (N, 3): and that share, colour by colour"""
     cells: I32_2D
     """shape (64, 4): cells yet to be done: first and last column and row"""
     free: Scalars
     """1 where nothing is in the way"""
-    weight: Scalars
+    weight: Vectors
     """of the rays to the sky"""
 
     @staticmethod
@@ -90,8 +91,8 @@ class QuietScratch(NamedTuple):
         count = _SPAN * _SPAN
         return QuietScratch(
             new_lanes(ViewScratch), new_lanes(Block, count), np.zeros(count, np.int32), np.zeros(count),
-            np.zeros(count), np.zeros(count), np.zeros(count, np.int32), np.zeros(count), np.zeros((64, 4), np.int32),
-            np.zeros(LANES), np.zeros(LANES),
+            np.zeros(count), np.zeros(count), np.zeros(count, np.int32), np.zeros((count, 3)),
+            np.zeros((64, 4), np.int32), np.zeros(LANES), np.zeros((LANES, 3)),
         )  # fmt: skip
 
 
@@ -122,7 +123,7 @@ def quiet_tile(
             for x in range(x0, x1):
                 i = _place(x - x0, y - y0)
                 if scratch.part[i] >= 0:
-                    scratch.places.sky_seen[i] = scratch.open[i]
+                    put(scratch.places.sky_seen, i, row(scratch.open, i))
                     add_sky(scratch.places, i, world.environment)
     _send(scratch, world, view, care, layer, x0, y0, x1, y1)
     return packet.tally[0], glass
@@ -334,58 +335,57 @@ def _fill(
             for i in range(a, c + 1):
                 if not _alike(scratch, first, _place(i, j), _ALIKE):
                     return False
-    low, high = math.inf, -math.inf
+    low, high = (math.inf, math.inf, math.inf), (-math.inf, -math.inf, -math.inf)
     for k in range(4):
         i, j = (c if k % 2 else a), (d if k // 2 else b)
         if scratch.part[_place(i, j)] >= 0:
             share = _node(scratch, world, care, i, j, x0, y0)
-            low, high = min(low, share), max(high, share)
+            low = (min(low[0], share[0]), min(low[1], share[1]), min(low[2], share[2]))
+            high = (max(high[0], share[0]), max(high[1], share[1]), max(high[2], share[2]))
     if small:
         return True
-    if high - low > care.step:
+    if max(high[0] - low[0], high[1] - low[1], high[2] - low[2]) > care.step:
         return False
     wide, tall = max(1, c - a), max(1, d - b)
-    upper_left, upper_right = scratch.open[_place(a, b)], scratch.open[_place(c, b)]
-    lower_left, lower_right = scratch.open[_place(a, d)], scratch.open[_place(c, d)]
+    upper_left, upper_right = row(scratch.open, _place(a, b)), row(scratch.open, _place(c, b))
+    lower_left, lower_right = row(scratch.open, _place(a, d)), row(scratch.open, _place(c, d))
     for j in range(b, d + 1):
         t = (j - b) / tall
         for i in range(a, c + 1):
             s = (i - a) / wide
             k = _place(i, j)
             if scratch.rays[k] == 0:
-                above = upper_left + (upper_right - upper_left) * s
-                below = lower_left + (lower_right - lower_left) * s
-                scratch.open[k] = above + (below - above) * t
+                above, below = lerp(upper_left, upper_right, s), lerp(lower_left, lower_right, s)
+                put(scratch.open, k, lerp(above, below, t))
     return True
 
 
 @inlined
-def _node(scratch: QuietScratch, world: World, care: Care, i: int, j: int, x0: int, y0: int) -> float:
+def _node(scratch: QuietScratch, world: World, care: Care, i: int, j: int, x0: int, y0: int) -> Vec:
     """The share of the sky that a place sees, by as many rays as cells of its size can be large."""
     k = _place(i, j)
     if scratch.rays[k] != 0:
-        return scratch.open[k]
+        return row(scratch.open, k)
     x, y = x0 + i, y0 + j
     rays = care.rays
     for level in range(_LEVELS):
         if (x | y) & ((2 << level) - 1) == 0:
             rays *= 2
     packet, places = scratch.looking.packet, scratch.places
-    seen = asked = 0.0
+    seen, asked = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     for first in range(0, rays, LANES):
         clear(packet)
         taken = min(LANES, rays - first)
         for lane in range(taken):
-            scratch.weight[lane] = add_sky_ray(
-                places, k, world.environment, packet, lane, _net_key(x, y), first + lane, rays
-            )
+            weight = add_sky_ray(places, k, world.environment, packet, lane, _net_key(x, y), first + lane, rays)
+            put(scratch.weight, lane, weight)
         visible(packet, world, OPAQUE, scratch.free)
         for lane in range(taken):
-            seen += scratch.weight[lane] * scratch.free[lane]
-            asked += scratch.weight[lane]
+            weight = row(scratch.weight, lane)
+            seen, asked = along(seen, weight, scratch.free[lane]), add(asked, weight)
     scratch.rays[k] = 1
-    scratch.open[k] = seen / asked if asked > 0.0 else 1.0
-    return scratch.open[k]
+    put(scratch.open, k, share_of_sky(seen, asked) if rays > 1 else seen)
+    return row(scratch.open, k)
 
 
 # --- what comes back ----------------------------------------------------------------------------------------------
@@ -423,4 +423,5 @@ def _keep_shares(
         if x < x1 and y < y1:
             i = _place(x - x0, y - y0)
             layer.seen[y, x, 0] = scratch.arrives[i] / scratch.possible[i] if scratch.possible[i] > 0.0 else 1.0
-            layer.seen[y, x, 1] = scratch.places.sky_seen[i]
+            for c in range(3):
+                layer.seen[y, x, 1 + c] = scratch.places.sky_seen[i, c]

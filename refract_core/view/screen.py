@@ -62,11 +62,11 @@ class SeenLight(NamedTuple):
     gloss: Vec
     """highlights and what is mirrored, as the eye sees it"""
     lamps: float
-    """share of their light that arrives, where that is known; so is the next"""
-    sky: float
+    """share of their light that arrives, where that is known; so is the next, colour by colour"""
+    sky: Vec
 
 
-_DARK = SeenLight(False, 0.0, 0.0, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, 0.0)
+_DARK = SeenLight(False, 0.0, 0.0, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, (0.0, 0.0, 0.0))
 
 
 class ScreenLight(NamedTuple):
@@ -256,8 +256,8 @@ def light_seen(screen: Screen, point: Vec, facing: Vec, agreeing: bool) -> SeenL
         return _DARK
     x0, y0 = math.floor(x), math.floor(y)
     total, low, high = 0.0, math.inf, 0.0
-    lamps = sky = 0.0
-    irradiance, gloss = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    lamps = 0.0
+    irradiance, gloss, sky = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     for k in range(4):
         ix, iy = x0 + k % 2, y0 + k // 2
         depth = screen.depth[iy * width + ix]
@@ -274,11 +274,11 @@ def light_seen(screen: Screen, point: Vec, facing: Vec, agreeing: bool) -> SeenL
         gloss = along(gloss, row(screen.gloss[iy], ix), w)
         if agreeing:
             lamps += w * screen.seen[iy, ix, 0]
-            sky += w * screen.seen[iy, ix, 1]
+            sky = along(sky, row(screen.seen[iy, :, 1:], ix), w)
     if total < 0.5 or (agreeing and high - low > _AGREE * high):
         return _DARK
     irradiance, gloss = scale(irradiance, 1.0 / total), scale(gloss, 1.0 / total)
-    return SeenLight(True, px, py, z, irradiance, gloss, lamps / total, sky / total)
+    return SeenLight(True, px, py, z, irradiance, gloss, lamps / total, scale(sky, 1.0 / total))
 
 
 @inlined

@@ -66,6 +66,8 @@ class EnvironmentTable(NamedTuple):
     """shape (H, G): the same for columns within a row"""
     row_cosines: F64_1D
     """shape (H + 1,): cosine of the angle to +Y above row i"""
+    tint: F32_2D
+    """shape (H * W, 3): colour of what comes from a texel that directions are drawn from, at luminance 1"""
 
 
 def pack(environment: Environment | None) -> EnvironmentTable:
@@ -86,7 +88,7 @@ def pack(environment: Environment | None) -> EnvironmentTable:
         source = np.empty((*SOURCE_SHAPE, 3), np.float32)
         _resample(_level_over(pool, levels, SOURCE_SHAPE), source)
         _convolve(source, _directions(*SOURCE_SHAPE), _directions(*IRRADIANCE_SHAPE), irradiance_pool)
-    row_cdf, column_cdf = _distribution(_level_over(pool, levels, SAMPLING_SHAPE))
+    row_cdf, column_cdf, tint = _distribution(_level_over(pool, levels, SAMPLING_SHAPE))
     return EnvironmentTable(
         present=environment is not None,
         dark=not pool[-1].any(),  # the last level is the mean of what is never negative
@@ -102,6 +104,7 @@ def pack(environment: Environment | None) -> EnvironmentTable:
         row_guide=guide_of(row_cdf),
         column_guide=np.stack([guide_of(cdf) for cdf in column_cdf]),
         row_cosines=np.cos(np.linspace(0.0, math.pi, len(row_cdf))),
+        tint=tint,
     )
 
 
@@ -166,16 +169,18 @@ def _directions(height: int, width: int) -> F64:
     return np.stack([x, y, z], axis=-1).reshape(-1, 3)
 
 
-def _distribution(pixels: F32) -> tuple[F64, F32]:
-    """Cumulative chances of rows, and of columns within rows, for directions drawn by luminance."""
+def _distribution(pixels: F32) -> tuple[F64, F32, F32]:
+    """Cumulative chances of rows, and of columns within rows, for directions drawn by luminance; and texels' tints."""
     shape = (min(pixels.shape[0], SAMPLING_SHAPE[0]), min(pixels.shape[1], SAMPLING_SHAPE[1]))
     small = np.empty((*shape, 3), np.float32)
     _resample(pixels, small)
-    bright = small.astype(np.float64) @ np.array(TEXEL_LUMINANCE)
+    light = small.astype(np.float64)
     # A bilinear lookup carries an eighth of a texel's light, along each axis, into either neighbour.
-    bright = 0.75 * bright + 0.125 * (np.roll(bright, 1, axis=1) + np.roll(bright, -1, axis=1))
-    padded = np.pad(bright, ((1, 1), (0, 0)), mode="edge")
-    bright = 0.75 * bright + 0.125 * (padded[:-2] + padded[2:])
+    light = 0.75 * light + 0.125 * (np.roll(light, 1, axis=1) + np.roll(light, -1, axis=1))
+    padded = np.pad(light, ((1, 1), (0, 0), (0, 0)), mode="edge")
+    light = 0.75 * light + 0.125 * (padded[:-2] + padded[2:])
+    bright = light @ np.array(TEXEL_LUMINANCE)
+    tint = np.divide(light, bright[..., None], out=np.ones_like(light), where=bright[..., None] > 0.0)
     areas = _solid_angles(*shape)[:, None]
     mean = float((bright * areas).sum()) / (4.0 * math.pi)
     chances = (bright * ((1.0 - FLOOR_SHARE) / mean) + FLOOR_SHARE if mean > 0.0 else np.ones(shape)) * areas
@@ -186,7 +191,7 @@ def _distribution(pixels: F32) -> tuple[F64, F32]:
     column_cdf /= rows[:, None]
     row_cdf /= row_cdf[-1]
     column_cdf[:, -1] = 1.0
-    return row_cdf, column_cdf.astype(np.float32)
+    return row_cdf, column_cdf.astype(np.float32), tint.reshape(-1, 3).astype(np.float32)
 
 
 def guide_of(cdf: F32 | F64) -> I16:
@@ -387,7 +392,13 @@ def _texel_pdf(table: EnvironmentTable, row: int, column: int) -> float:
 
 
 @inlined
-def sample_direction(table: EnvironmentTable, u1: float, u2: float) -> tuple[Vec, float]:
+def _tint(table: EnvironmentTable, row: int, column: int) -> Vec:
+    texel = row * (table.column_cdf.shape[1] - 1) + column
+    return (np.float64(table.tint[texel, 0]), np.float64(table.tint[texel, 1]), np.float64(table.tint[texel, 2]))
+
+
+@inlined
+def sample_direction(table: EnvironmentTable, u1: float, u2: float) -> tuple[Vec, float, Vec]:
     """Draw a direction in proportion to luminance, one in a hundred evenly (inversion; PBRT 4, section 12.5).
 
     Args:
@@ -396,7 +407,7 @@ def sample_direction(table: EnvironmentTable, u1: float, u2: float) -> tuple[Vec
         u2: Uniform in 0 .. 1, picks the column and the place in it.
 
     Returns:
-        Unit world direction towards the light, and its density [1/sr], > 0.
+        Unit world direction towards the light, its density [1/sr], > 0, and the tint of what comes from there.
     """
     columns = table.column_cdf.shape[1] - 1
     row = pick(table.row_cdf, table.row_guide, u1)
@@ -415,12 +426,13 @@ def sample_direction(table: EnvironmentTable, u1: float, u2: float) -> tuple[Vec
         m[0, 1] * x + m[1, 1] * y + m[2, 1] * z,
         m[0, 2] * x + m[1, 2] * y + m[2, 2] * z,
     )
-    return world, _texel_pdf(table, row, column)
+    return world, _texel_pdf(table, row, column), _tint(table, row, column)
 
 
 @inlined
-def direction_pdf(table: EnvironmentTable, d: Vec) -> float:
-    """Density with which `sample_direction` draws world direction `d` [1/sr]."""
+def direction_pdf(table: EnvironmentTable, d: Vec) -> tuple[float, Vec]:
+    """Density with which `sample_direction` draws world direction `d` [1/sr], and the tint of what comes from there."""
     u, v = _position(table, d)
     rows, columns = table.column_cdf.shape[0], table.column_cdf.shape[1] - 1
-    return _texel_pdf(table, min(int(v * rows), rows - 1), min(max(int(u * columns), 0), columns - 1))
+    row, column = min(int(v * rows), rows - 1), min(max(int(u * columns), 0), columns - 1)
+    return _texel_pdf(table, row, column), _tint(table, row, column)

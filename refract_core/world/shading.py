@@ -10,15 +10,17 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
+
 from ..kernels.compile import inlined
 from ..kernels.lanes import LANES, Flags, Scalars, Vectors, Words, put
-from ..kernels.sampling import MIRRORED, Key, Keys, Purpose, branched, key_of, set_key, unit_pair
+from ..kernels.sampling import MIRRORED, Key, Keys, Purpose, branched, hash32, key_of, set_key, unit_pair
 from ..kernels.vec import Vec, add, dot, flip_towards, frame, lerp, mul, normalize, row, scale, sub
 from ..optics.interface import f0_from_ior
 from ..optics.lobes import MIRROR_ALPHA, sample_half_vector, specular_albedo
 from ..scene import Param
 from .embree import SCATTERED, Packet, clear, has_hit, ray_direction, set_ray
-from .environment import EnvironmentTable, direction_pdf, irradiance, prefiltered, sample_direction
+from .environment import TEXEL_LUMINANCE, EnvironmentTable, direction_pdf, irradiance, prefiltered, sample_direction
 from .lights import LightTable, highlight, irradiance_factor, shadow_ray
 from .offsets import off_surface
 from .surface import Interaction, color_input, float_input, hit_in, interaction, normal_input, share_input
@@ -30,7 +32,8 @@ _POLISHED_ROUGHNESS = 0.2
 """Mirrors up to the first roughness, and dielectrics up to the second, reflect the scene by a ray of their own; others
 take their reflection from the environment map alone."""
 _COAT_F0 = 0.04  # a clear coat of ior 1.5 (UsdPreviewSurface)
-_COSINE_CANDIDATES = 2
+_MOST_DRAWS = 32
+"""Directions to the sky that are tried before one by the cosine alone is taken."""
 LOBES = 4
 """Rays to a light for each ray of a rough mirror: what it sees is lit by one more."""
 
@@ -80,11 +83,12 @@ class Block(NamedTuple):
     """irradiance that arrived"""
     specular: Vectors
     """radiance towards wo of the lights' highlights"""
-    sky_seen: Scalars
-    """share of the sky's light that arrives, 0 .. 1"""
-    sky_asked: Scalars
+    sky_seen: Vectors
+    """share of the sky's light that arrives, colour by colour, >= 0; above 1 where one ray that saw a coloured place
+    stands for all"""
+    sky_asked: Vectors
     """sum of the weights of the rays to the sky"""
-    sky_weight: Scalars
+    sky_weight: Vectors
     """and that of the last"""
     color: Vectors
     """the result: radiance towards wo"""
@@ -200,7 +204,8 @@ def copy_lane(to: Block, i: int, block: Block, lane: int) -> None:
     put(to.emissive, i, row(block.emissive, lane))
     to.roughness[i], to.coat[i] = block.roughness[lane], block.coat[lane]
     to.coat_roughness[i], to.occlusion[i] = block.coat_roughness[lane], block.occlusion[lane]
-    to.distance[i], to.sky_seen[i] = block.distance[lane], block.sky_seen[lane]
+    to.distance[i] = block.distance[lane]
+    put(to.sky_seen, i, row(block.sky_seen, lane))
     put(to.diffuse, i, row(block.diffuse, lane))
     put(to.specular, i, row(block.specular, lane))
 
@@ -222,7 +227,7 @@ def forget_light(block: Block, lane: int) -> None:
     """Nothing has arrived yet."""
     for c in range(3):
         block.diffuse[lane, c] = block.specular[lane, c] = 0.0
-    block.sky_seen[lane] = 1.0
+        block.sky_seen[lane, c] = 1.0
 
 
 @inlined
@@ -315,7 +320,8 @@ def _gather_sky(block: Block, packet: Packet, world: World, mask: int) -> None:
         return
     most = 0
     for lane in range(LANES):
-        block.sky_seen[lane] = block.sky_asked[lane] = 0.0
+        for c in range(3):
+            block.sky_seen[lane, c] = block.sky_asked[lane, c] = 0.0
         if block.on[lane] != 0 and block.matte[lane] != 0:
             most = max(most, block.rays[lane])
     for k in range(most):
@@ -323,26 +329,45 @@ def _gather_sky(block: Block, packet: Packet, world: World, mask: int) -> None:
         for lane in range(LANES):
             if block.on[lane] != 0 and block.matte[lane] != 0 and k < block.rays[lane]:
                 key, rays = key_of(block.key, lane), block.rays[lane]
-                block.sky_weight[lane] = add_sky_ray(block, lane, environment, packet, lane, key, k, rays)
+                weight = add_sky_ray(block, lane, environment, packet, lane, key, k, rays)
+                put(block.sky_weight, lane, weight)
         visible(packet, world, mask, block.free)
         for lane in range(LANES):
             if block.on[lane] != 0 and block.matte[lane] != 0 and k < block.rays[lane]:
-                block.sky_seen[lane] += block.sky_weight[lane] * block.free[lane]
-                block.sky_asked[lane] += block.sky_weight[lane]
+                for c in range(3):
+                    block.sky_seen[lane, c] += block.sky_weight[lane, c] * block.free[lane]
+                    block.sky_asked[lane, c] += block.sky_weight[lane, c]
     for lane in range(LANES):
-        block.sky_seen[lane] = block.sky_seen[lane] / block.sky_asked[lane] if block.sky_asked[lane] > 0.0 else 1.0
         if block.on[lane] != 0 and block.matte[lane] != 0:
+            if block.rays[lane] > 1:
+                put(block.sky_seen, lane, share_of_sky(row(block.sky_seen, lane), row(block.sky_asked, lane)))
             add_sky(block, lane, environment)
+        else:
+            put(block.sky_seen, lane, (1.0, 1.0, 1.0))
+
+
+@inlined
+def share_of_sky(seen: Vec, asked: Vec) -> Vec:
+    """The share of the sky that arrives, colour by colour: weights of the rays that got through over those of all."""
+    return (
+        seen[0] / asked[0] if asked[0] > 0.0 else 1.0,
+        seen[1] / asked[1] if asked[1] > 0.0 else 1.0,
+        seen[2] / asked[2] if asked[2] > 0.0 else 1.0,
+    )
 
 
 @inlined
 def add_sky_ray(
     block: Block, i: int, environment: EnvironmentTable, packet: Packet, lane: int, key: Key, k: int, times: int
-) -> float:
-    """Put ray `k` of `times` from hit `i` to the sky into a lane. Returns for how much it counts among them."""
+) -> Vec:
+    """Put ray `k` of `times` from hit `i` to the sky into a lane. Returns for how much it counts among them, colour by
+    colour; of one that is alone, the share of the sky's light that arrives if it gets through."""
     n = row(block.ns, i)
-    if times == 1 or environment.even:
-        direction, weight = _sky_direction(environment, n, nth(key, k, times)), 1.0
+    if environment.even:  # the cosine alone is the density, and keeps the strata of the sequence
+        u1, u2 = unit_pair(nth(key, k, times), Purpose.SKY_COSINE.value)
+        direction, weight = _cosine_direction(n, u1, u2), (1.0, 1.0, 1.0)
+    elif times == 1:
+        direction, weight = _sky_direction(environment, n, key)
     else:
         direction, weight = _nth_sky_direction(environment, n, key, k, times)
     add_shadow_ray(packet, lane, row(block.point, i), row(block.ng, i), direction, math.inf)
@@ -350,7 +375,7 @@ def add_sky_ray(
 
 
 @inlined
-def _nth_sky_direction(environment: EnvironmentTable, n: Vec, key: Key, k: int, times: int) -> tuple[Vec, float]:
+def _nth_sky_direction(environment: EnvironmentTable, n: Vec, key: Key, k: int, times: int) -> tuple[Vec, Vec]:
     """One of many directions to the sky, and its weight: every other one by the cosine, the rest by the radiance.
 
     Each half keeps the strata of its sequence; a weight is what comes from there over the density with which both
@@ -360,63 +385,59 @@ def _nth_sky_direction(environment: EnvironmentTable, n: Vec, key: Key, k: int, 
     own = nth(key, k // 2, half if k % 2 else times - half)
     if k % 2:
         u1, u2 = unit_pair(own, Purpose.SKY_RADIANCE.value)
-        direction, radiance = sample_direction(environment, u1, u2)
+        direction, radiance, tint = sample_direction(environment, u1, u2)
     else:
         u1, u2 = unit_pair(own, Purpose.SKY_COSINE.value)
         direction = _cosine_direction(n, u1, u2)
-        radiance = direction_pdf(environment, direction)
+        radiance, tint = direction_pdf(environment, direction)
     cosine = dot(direction, n)
     if cosine <= 0.0:
-        return n, 0.0
-    return direction, cosine * radiance / ((times - half) * cosine / math.pi + half * radiance)
+        return n, (0.0, 0.0, 0.0)
+    return direction, scale(tint, cosine * radiance / ((times - half) * cosine / math.pi + half * radiance))
 
 
 @inlined
 def add_sky(block: Block, lane: int, environment: EnvironmentTable) -> None:
     """Add the sky, whose share is known but for what the material keeps out."""
-    block.sky_seen[lane] *= block.occlusion[lane]
-    if block.sky_seen[lane] > 0.0:
+    share = scale(row(block.sky_seen, lane), block.occlusion[lane])
+    put(block.sky_seen, lane, share)
+    if share[0] > 0.0 or share[1] > 0.0 or share[2] > 0.0:
         e = irradiance(environment, row(block.ns, lane))
-        for c in range(3):
-            block.diffuse[lane, c] += e[c] * block.sky_seen[lane]
+        put(block.diffuse, lane, add(row(block.diffuse, lane), mul(e, share)))
 
 
 @inlined
-def _sky_direction(environment: EnvironmentTable, n: Vec, key: Key) -> Vec:
-    """A direction with about the density of the sky's radiance times its cosine.
+def _sky_direction(environment: EnvironmentTable, n: Vec, key: Key) -> tuple[Vec, Vec]:
+    """The only direction to the sky, with the density of what it brings, and what arrives from all the sky's light if
+    it gets through.
 
-    Resampled importance sampling (Talbot et al. 2005) among two directions by the cosine and one by the radiance, each
-    weighted by what it would bring over the density with which the three together draw it (Veach's balance heuristic).
-    Under an even sky the visibility it finds is within 0.01 of the truth; one direction by the radiance more, and none
-    by the cosine, would be off by 0.15 before a low wall.
+    Directions by the radiance are refused with the chance that the cosine is small (von Neumann 1951), so that what is
+    kept has both in its density, and the mean of what gets through is the share that arrives, however small a sun is.
+    (Choosing among a few candidates instead is off by 0.15 where a sun is hidden.) The first sample of a pixel takes
+    the share for all colours, so that a picture of one sample has no noise of colour where all of the sky is seen.
     """
-    if environment.even:
-        # The cosine alone is the density, and one direction keeps the sequence's strata, which a choice would break.
-        u1, u2 = unit_pair(key, Purpose.SKY_COSINE.value)
-        return _cosine_direction(n, u1, u2)
-    direction, total = n, 0.0
-    pick = unit_pair(key, Purpose.SKY_PICK.value)[0]
-    for k in range(_COSINE_CANDIDATES + 1):
-        if k < _COSINE_CANDIDATES:
-            own = Key(key.x, key.y, key.branch, _COSINE_CANDIDATES * key.sample + k)
-            u1, u2 = unit_pair(own, Purpose.SKY_COSINE.value)
-            candidate = _cosine_direction(n, u1, u2)
-            radiance = direction_pdf(environment, candidate)
-        else:
-            u1, u2 = unit_pair(key, Purpose.SKY_RADIANCE.value)
-            candidate, radiance = sample_direction(environment, u1, u2)
-        cosine = dot(candidate, n)
-        if cosine <= 0.0:
-            continue
-        w = cosine * radiance / (_COSINE_CANDIDATES * cosine / math.pi + radiance)
-        total += w
-        chance = w / total
-        if pick < chance:
-            direction = candidate
-            pick /= chance
-        else:
-            pick = (pick - chance) / max(1.0 - chance, 1e-9)
-    return direction
+    branch = int(np.int64(key.branch))  # whatever width it had
+    for k in range(_MOST_DRAWS):
+        own = Key(key.x, key.y, branch, key.sample)
+        u1, u2 = unit_pair(own, Purpose.SKY_RADIANCE.value)
+        direction, _, tint = sample_direction(environment, u1, u2)
+        if unit_pair(own, Purpose.SKY_PICK.value)[0] < dot(direction, n):
+            return direction, (1.0, 1.0, 1.0) if key.sample == 0 else _beside_all(environment, n, tint)
+        branch = int(np.int64(hash32(key.branch, k, 0)))
+    u1, u2 = unit_pair(key, Purpose.SKY_COSINE.value)
+    return _cosine_direction(n, u1, u2), (1.0, 1.0, 1.0)
+
+
+@inlined
+def _beside_all(environment: EnvironmentTable, n: Vec, tint: Vec) -> Vec:
+    """The colour of light that comes from one place, over that of all the sky's at a surface, at the same luminance."""
+    e = irradiance(environment, n)
+    light = dot(e, TEXEL_LUMINANCE)
+    return (
+        light * tint[0] / e[0] if e[0] > 0.0 else 0.0,
+        light * tint[1] / e[1] if e[1] > 0.0 else 0.0,
+        light * tint[2] / e[2] if e[2] > 0.0 else 0.0,
+    )
 
 
 @inlined
@@ -454,17 +475,18 @@ def _add_matt(block: Block) -> None:
 @inlined
 def _add_gloss_of_sky(block: Block, lane: int, world: World, f0: Vec, roughness: float, weight: float) -> None:
     """Add the environment's mirror lobe, dimmed by the visibility found for its diffuse light."""
-    if not world.environment.present or block.sky_seen[lane] == 0.0:
+    seen = row(block.sky_seen, lane)
+    if not world.environment.present or (seen[0] == 0.0 and seen[1] == 0.0 and seen[2] == 0.0):
         return
     n, wo = row(block.ns, lane), row(block.wo, lane)
     cosine = min(1.0, max(1e-3, dot(n, wo)))
     r = sub(scale(n, 2.0 * dot(n, wo)), wo)
-    light = scale(prefiltered(world.environment, r, roughness), weight * block.sky_seen[lane])
+    light = mul(scale(prefiltered(world.environment, r, roughness), weight), seen)
     put(block.color, lane, add(row(block.color, lane), mul(light, specular_albedo(f0, roughness, cosine))))
 
 
 @inlined
-def gloss(block: Block, lane: int, world: World, lamps: float, sky: float) -> Vec:
+def gloss(block: Block, lane: int, world: World, lamps: float, sky: Vec) -> Vec:
     """Highlights and what is mirrored of the sky, of a surface that mirrors nothing else, where the shares of lamps and
     sky that arrive are known. The light that has been gathered is lost."""
     lights = world.lights
@@ -475,7 +497,7 @@ def gloss(block: Block, lane: int, world: World, lamps: float, sky: float) -> Ve
             block.lamp_seen[lane] = lamps if lights.casts_shadow[l] != 0 else 1.0
             add_light(block, lane, lights, l)
     put(block.color, lane, row(block.specular, lane))
-    block.sky_seen[lane] = sky
+    put(block.sky_seen, lane, sky)
     _add_gloss_of_sky(block, lane, world, row(block.f0, lane), block.roughness[lane], 1.0)
     _add_coat_of_sky(block, lane, world)
     return row(block.color, lane)

@@ -16,6 +16,7 @@ from .world import NEAR, OPAQUE, Hit, World, first
 
 _MIRROR_ALPHA = 1e-3
 _COAT_F0 = (0.04, 0.04, 0.04)
+_LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
 class View(NamedTuple):
@@ -32,8 +33,8 @@ class Gathered(NamedTuple):
 
     irradiance: Vec
     highlights: Vec
-    sky_seen: float
-    """visibility of the environment, times occlusion"""
+    sky_seen: Vec
+    """visibility of the environment by colour, times occlusion"""
 
 
 class Shader:
@@ -90,42 +91,38 @@ class Shader:
                     continue
             irradiance = add(irradiance, scaled(lamp.radiance, even))
             highlights = add(highlights, mul(lamp.radiance, vec([gloss * f + over for f in fresnel])))
-        seen = 0.0
+        seen = ZERO
         if self.sky is not None:
-            d = self._sky_direction(self.sky, s.ns, key, sample)
-            seen = s.occlusion if self._free(s, d, math.inf) else 0.0
-            if seen > 0.0:
-                irradiance = add(irradiance, scaled(self.sky.irradiance(s.ns), seen))
+            d, share = self._sky_direction(self.sky, s.ns, key, sample)
+            if self._free(s, d, math.inf):
+                seen = scaled(share, s.occlusion)
+                irradiance = add(irradiance, mul(self.sky.irradiance(s.ns), seen))
         return Gathered(irradiance, highlights, seen)
 
-    def _sky_direction(self, sky: Sky, n: Vec, key: Key, sample: int) -> Vec:
-        """Where the environment's visibility is asked: one of two directions by the cosine and a bright one, by what
-        each brings over the density of all three (Talbot et al. 2005; Veach's balance heuristic)."""
-        pick = sampling.pair(key, sample, sampling.SKY_PICK)[0]
-        x, y = basis(n)
+    def _sky_direction(self, sky: Sky, n: Vec, key: Key, sample: int) -> tuple[Vec, Vec]:
+        """Where the environment's visibility is asked, and what arrives of its irradiance from all around if it is free
+        there: bright directions, each kept with the chance of its cosine (von Neumann 1951)."""
 
-        def by_cosine(number: int) -> Vec:
-            u1, u2 = sampling.pair(key, number, sampling.SKY_COSINE)
+        def by_cosine() -> Vec:
+            x, y = basis(n)
+            u1, u2 = sampling.pair(key, sample, sampling.SKY_COSINE)
             flat = add(scaled(x, math.cos(2.0 * math.pi * u2)), scaled(y, math.sin(2.0 * math.pi * u2)))
             return add(scaled(flat, math.sqrt(u1)), scaled(n, math.sqrt(1.0 - u1)))
 
+        white = (1.0, 1.0, 1.0)
         if sky.even:  # then the cosine is all there is
-            return by_cosine(sample)
-        candidates = [by_cosine(2 * sample), by_cosine(2 * sample + 1)]
-        candidates.append(sky.drawn(*sampling.pair(key, sample, sampling.SKY_RADIANCE)))
-        chosen, total = n, 0.0
-        for candidate in candidates:
-            cosine, density = dot(candidate, n), sky.density(candidate)
-            if cosine <= 0.0:
-                continue
-            weight = cosine * density / (2.0 * cosine / math.pi + density)
-            total += weight
-            chance = weight / total
-            if pick < chance:
-                chosen, pick = candidate, pick / chance
-            else:
-                pick = (pick - chance) / max(1.0 - chance, 1e-9)
-        return chosen
+            return by_cosine(), white
+        for attempt in range(32):
+            branch = key[2] if attempt == 0 else sampling.hashed(key[2], attempt - 1, 0)
+            own = (key[0], key[1], branch)
+            d = sky.drawn(*sampling.pair(own, sample, sampling.SKY_RADIANCE))
+            if sampling.pair(own, sample, sampling.SKY_PICK)[0] < dot(d, n):
+                if sample == 0:
+                    return d, white
+                e, light = sky.irradiance(n), sky.blurred(d)
+                share = dot(e, _LUMINANCE) / dot(light, _LUMINANCE)
+                return d, vec([share * light[c] / e[c] if e[c] > 0.0 else 0.0 for c in range(3)])
+        return by_cosine(), white
 
     def radiance(self, hit: Hit, d: Vec, key: Key, sample: int) -> Vec:
         """Of an opaque hit, back along the ray that met it."""
@@ -165,10 +162,10 @@ class Shader:
 
     def _sky_gloss(self, s: Surface, g: Gathered, f0: Vec, roughness: float) -> Vec:
         """The environment's mirror lobe, dimmed by the visibility found for its diffuse light."""
-        if self.sky is None or g.sky_seen == 0.0:
+        if self.sky is None:
             return ZERO
         r = sub(scaled(s.ns, 2.0 * dot(s.ns, s.wo)), s.wo)
-        return scaled(mul(self.sky.lobe(r, roughness), specular_albedo(f0, roughness, _shown_cosine(s))), g.sky_seen)
+        return mul(mul(self.sky.lobe(r, roughness), specular_albedo(f0, roughness, _shown_cosine(s))), g.sky_seen)
 
 
 def ray_bits(o: Vec, d: Vec) -> tuple[int, int, int]:

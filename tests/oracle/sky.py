@@ -108,17 +108,8 @@ class Sky:
     @cached_property
     def _chances(self) -> tuple[list[float], list[list[float]]]:
         """Cumulative chance of rows, and of columns in each row."""
-        image = self.levels[0]
-        height, width = len(image), len(image[0])
-        if height > 256 or width > 512:
-            raise NotImplementedError("directions on larger maps are drawn from a coarser level")
-        bright = [[0.2126 * t[0] + 0.7152 * t[1] + 0.0722 * t[2] for t in row] for row in image]
-        # A bilinear lookup spreads an eighth of a texel's light into each neighbour.
-        bright = [[0.75 * r[x] + 0.125 * (r[x - 1] + r[(x + 1) % width]) for x in range(width)] for r in bright]
-        spread = []
-        for y in range(height):
-            up, down = bright[max(y - 1, 0)], bright[min(y + 1, height - 1)]
-            spread.append([0.75 * bright[y][x] + 0.125 * (up[x] + down[x]) for x in range(width)])
+        spread = [[0.2126 * t[0] + 0.7152 * t[1] + 0.0722 * t[2] for t in row] for row in self._blurred]
+        height, width = len(spread), len(spread[0])
         areas = _areas(height, width)
         mean = sum(a * sum(row) for a, row in zip(areas, spread, strict=True)) / (4.0 * math.pi)
         chance = [
@@ -126,6 +117,33 @@ class Sky:
             for a, row in zip(areas, spread, strict=True)
         ]
         return _cumulative([sum(row) for row in chance]), [_cumulative(row) for row in chance]
+
+    @cached_property
+    def _blurred(self) -> Image:
+        """The map as directions are drawn from it."""
+        image = self.levels[0]
+        height, width = len(image), len(image[0])
+        if height > 256 or width > 512:
+            raise NotImplementedError("directions on larger maps are drawn from a coarser level")
+        # A bilinear lookup spreads an eighth of a texel's light into each neighbour.
+        across = [
+            [add(scaled(r[x], 0.75), scaled(add(r[x - 1], r[(x + 1) % width]), 0.125)) for x in range(width)]
+            for r in image
+        ]
+        spread = []
+        for y in range(height):
+            up, down = across[max(y - 1, 0)], across[min(y + 1, height - 1)]
+            spread.append(
+                [add(scaled(across[y][x], 0.75), scaled(add(up[x], down[x]), 0.125)) for x in range(width)]
+            )
+        return spread
+
+    def blurred(self, d: Vec) -> Vec:
+        """Radiance of the texel that a world direction is drawn in; white where it is black."""
+        u, v = self._uv(d)
+        height, width = len(self._blurred), len(self._blurred[0])
+        light = self._blurred[min(int(v * height), height - 1)][min(int(u * width), width - 1)]
+        return light if max(light) > 0.0 else (1.0, 1.0, 1.0)
 
     def density(self, d: Vec) -> float:
         """Chance per solid angle with which `drawn` gives a world direction [1/sr]."""
