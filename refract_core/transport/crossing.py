@@ -100,6 +100,7 @@ class Meeting(NamedTuple):
     """on entering; 0 on leaving"""
 
     # The branches, from `cross` on.
+    reflectance: Vectors
     mirrors: Flags
     """1 where a mirrored ray is sent"""
     mirrored_weight: Vectors
@@ -274,6 +275,7 @@ def _bend(meeting: Meeting, lane: int, c: int, d: Vec, n1: float, n2: float) -> 
 @inlined
 def _weigh(meeting: Meeting, lane: int, now: Rays, c: int, share: float) -> None:
     """Weights of channel `c` on both sides."""
+    meeting.reflectance[lane, c] = share
     w, clear = now.weight[lane, c], now.clear[lane, c]
     kept = (1.0 - share) * (1.0 - meeting.opacity[lane])
     meeting.mirrored_weight[lane, c] = w * share

@@ -59,6 +59,8 @@ class Block(NamedTuple):
     """diffuse reflectance, 0 .. 1"""
     f0: Vectors
     """reflectance at normal incidence"""
+    fresnel: Vectors
+    """and towards wo"""
     emissive: Vectors
     """radiance"""
     roughness: Scalars
@@ -155,6 +157,7 @@ def load_surface(block: Block, lane: int, at: Interaction, world: World, wo: Vec
     put(block.wo, lane, wo)
     put(block.albedo, lane, diffuse)
     put(block.f0, lane, f0)
+    put(block.fresnel, lane, _fresnel(f0, roughness, max(0.0, dot(ns, wo))))
     put(block.emissive, lane, color_input(world, at, Param.EMISSIVE.value))
     block.roughness[lane] = roughness
     block.coat[lane] = share_input(world, at, Param.CLEARCOAT.value)
@@ -201,6 +204,7 @@ def copy_lane(to: Block, i: int, block: Block, lane: int) -> None:
     put(to.wo, i, row(block.wo, lane))
     put(to.albedo, i, row(block.albedo, lane))
     put(to.f0, i, row(block.f0, lane))
+    put(to.fresnel, i, row(block.fresnel, lane))
     put(to.emissive, i, row(block.emissive, lane))
     to.roughness[i], to.coat[i] = block.roughness[lane], block.coat[lane]
     to.coat_roughness[i], to.occlusion[i] = block.coat_roughness[lane], block.occlusion[lane]
@@ -298,7 +302,7 @@ def add_light(block: Block, lane: int, lights: LightTable, l: int) -> None:  # n
         return
     radiance = scale(row(lights.radiance, l), seen)
     n, wo, p = row(block.ns, lane), row(block.wo, lane), row(block.point, lane)
-    f = _fresnel(row(block.f0, lane), block.roughness[lane], max(0.0, dot(n, wo)))
+    f = row(block.fresnel, lane)
     coat = block.coat[lane]
     coat_light = 0.0
     if coat > 0.0:

@@ -74,9 +74,10 @@ class Shader:
 
     # --- Light ---
 
-    def gather(self, s: Surface, key: Key, sample: int) -> Gathered:
+    def gather(self, s: Surface, key: Key, sample: int, mirrored: Vec | None = None) -> Gathered:
+        """`mirrored`: what the surface reflects of a lamp, where that is known better."""
         irradiance, highlights = ZERO, ZERO
-        fresnel = _lowered_schlick(s)
+        fresnel = mirrored or _lowered_schlick(s)
         coat = s.coat * (0.04 + 0.96 * (1.0 - clamp(dot(s.ns, s.wo))) ** 5)
         for k, lamp in enumerate(self.lamps):
             even = lights.irradiance(lamp, s.point, s.ns) * lamp.diffuse

@@ -297,7 +297,6 @@ class Tree:
         if step is not Step.LEAVES:
             m = self.scene.materials[hit.face.material]
             opacity = clamp(number(self.scene, hit, m, Param.OPACITY))
-            self._shine(ray, s, opacity, view, grown)
 
         before = filling(ray.media)
         after = choice.body if step in (Step.PANE, Step.TYPED) else filling(choice.behind)
@@ -309,6 +308,8 @@ class Tree:
             split = self._of_channel(ray, s, step, eta)
             ways.append(_Way(c, _only(c) if apart else WHITE, 1.0 / eta, split))
         mirrored = [way.split.reflectance for way in ways] * (1 if apart else 3)
+        if step is not Step.LEAVES:
+            self._shine(ray, s, opacity, (mirrored[0], mirrored[1], mirrored[2]), view, grown)
         whole = _Part(ray.weight, ray.clear)
         back = whole.by((mirrored[0], mirrored[1], mirrored[2]))
         through = [whole.by(scaled(w.mask, (1.0 - w.split.reflectance) * (1.0 - opacity))) for w in ways]
@@ -398,9 +399,9 @@ class Tree:
         inside = unit(sub(passage.point, s.point))
         return _beside(child._replace(direction=inside, far=passage.path, inner=Inner(body, passage)), s)
 
-    def _shine(self, ray: Ray, s: Surface, opacity: float, view: View, grown: Grown) -> None:
+    def _shine(self, ray: Ray, s: Surface, opacity: float, mirrored: Vec, view: View, grown: Grown) -> None:
         """Of the surface itself. What the first one sends out by itself is in neither of the planes."""
-        gathered = self.shader.gather(s, _key(view, ray), view.sample)
+        gathered = self.shader.gather(s, _key(view, ray), view.sample, mirrored)
         own = mul(ray.weight, scaled(diffuse(s, gathered), opacity))
         highlights = mul(ray.weight, gathered.highlights)
         if ray.side is Side.VIEW:
