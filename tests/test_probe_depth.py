@@ -18,7 +18,7 @@ from refract_core.kernels.lanes import by_address
 from refract_core.probes.depth import meet_depths
 from refract_core.probes.lookup import ProbeTable
 from refract_core.probes.volumes import INFINITE_DISTANCE
-from refract_core.rendering.session import Session, capture_probes
+from refract_core.rendering.session import Ready, capture_probes
 from refract_core.scene import Mesh, Model, Probe, Scene, Sphere
 
 F64 = NDArray[np.float64]
@@ -41,7 +41,7 @@ def _meet_all(table: ProbeTable, origins: F64, rays: F64, out: F64) -> None:
         out[i, 0], out[i, 1] = 1.0 if met.known else 0.0, met.distance
 
 
-def meet(session: Session, origins: F64, rays: F64) -> tuple[B1, F64]:
+def meet(session: Ready, origins: F64, rays: F64) -> tuple[B1, F64]:
     """Whether the picture shows where each ray ends, and how far away that is [m]."""
     out = np.empty((len(rays), 2))
     _meet_all(by_address(session.probes), np.ascontiguousarray(origins), np.ascontiguousarray(rays), out)

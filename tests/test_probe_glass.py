@@ -30,7 +30,7 @@ from test_probes import directions, look, probe
 
 import refract_core as rc
 from refract_core.rendering.picture import glass_over
-from refract_core.rendering.session import Session, prepare
+from refract_core.rendering.session import Ready, prepare
 from refract_core.rendering.work import Work
 from refract_core.scene import Camera, Material, Mesh, Model, Scene, Sphere
 from refract_core.settings import RenderSettings
@@ -41,7 +41,7 @@ SLAB = box("/slab", (2.5, 2.5, 0.2), 1, centre=(0, 0, -1.5))
 AHEAD = np.array([[0.0, 0.0, -1.0], [0.3, 0.2, -1.0], [-0.5, 0.4, -1.0]])
 
 
-def prepared(what: Scene, **settings: Any) -> Session:
+def prepared(what: Scene, **settings: Any) -> Ready:
     """Capture the probes of a scene as a picture does."""
     chosen = RenderSettings(**{"samples": 1, "tiers": ("probe", "sky"), "jobs": 1, **settings})
     with ThreadPoolExecutor(1) as executor:

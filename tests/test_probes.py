@@ -30,7 +30,7 @@ from refract_core.kernels.compile import kernel
 from refract_core.kernels.lanes import by_address
 from refract_core.probes.lookup import ProbeTable, cube_at
 from refract_core.probes.plan import in_order
-from refract_core.rendering.session import Session, prepare
+from refract_core.rendering.session import Ready, prepare
 from refract_core.rendering.work import Work
 from refract_core.scene import Model, Probe, Scene, Sphere, Volume
 from refract_core.settings import RenderSettings
@@ -52,7 +52,7 @@ def probe(point: tuple[float, float, float] = CENTRE, **fields: Any) -> Probe:
     return replace(base, **fields)
 
 
-def prepared(what: Scene, samples: int = 1) -> Session:
+def prepared(what: Scene, samples: int = 1) -> Ready:
     """Capture the probes of a scene as a picture would."""
     chosen = RenderSettings(samples=samples, tiers=("probe", "sky"), jobs=1)
     with ThreadPoolExecutor(1) as executor:
@@ -66,7 +66,7 @@ def _look(table: ProbeTable, k: int, directions: F64, lod: float, out: F64) -> N
         out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = cube_at(table, k, d, lod)
 
 
-def look(session: Session, directions: F64, lod: float = 0.0, k: int = 0) -> F64:
+def look(session: Ready, directions: F64, lod: float = 0.0, k: int = 0) -> F64:
     """Rows of (r, g, b, coverage, distance)."""
     out = np.empty((len(directions), 5))
     _look(by_address(session.probes), k, np.ascontiguousarray(directions), lod, out)

@@ -29,7 +29,8 @@ from ..view.planes import by_name, finish_of, finish_tile, new_planes
 from ..world.embree import Bvh
 from ..world.tables import World, prim_of
 from .branching import Tree, needs_compiling
-from .session import PROBE_SAMPLES, Session, choose_camera, prepare, prepare_bare
+from .reuse import Session
+from .session import PROBE_SAMPLES, Ready, choose_camera, prepare, prepare_bare
 from .work import Cancel, Progress, Work, tiles_of, working
 
 
@@ -46,6 +47,7 @@ def render(
     progress: Progress | None = None,
     cancel: Cancel | None = None,
     executor: Executor | None = None,
+    session: Session | None = None,
 ) -> Frame:
     """Render one picture of a scene.
 
@@ -53,6 +55,7 @@ def render(
         progress: called with a fraction 0 .. 1 and the name of the stage of work.
         cancel: asked between tiles; True stops the render.
         executor: where tiles run; must share this process's memory. None makes `settings.jobs` threads.
+        session: has what earlier pictures needed, and keeps what this one does; the picture is the same without it.
 
     Raises:
         UsageError: no such camera, or a camera without a field of view.
@@ -67,8 +70,8 @@ def render(
     with working(executor, settings.jobs, progress, cancel) as work:
         if needs_compiling(settings):
             work.progress(0.0, COMPILING)
-        session = prepare(scene, camera, settings, work, glass_over(scene, camera, settings, work))
-        planes, rays = _draw(session, scene, camera, settings, (width, height), work)
+        ready = prepare(scene, camera, settings, work, glass_over(scene, camera, settings, work), session)
+        planes, rays = _draw(ready, scene, camera, settings, (width, height), work)
         work.progress(1.0, "done")
     metadata: dict[str, str | float] = {
         "software": f"refract {__version__}",
@@ -79,10 +82,10 @@ def render(
         "refract:tiers": ",".join(settings.tiers),
         "refract:screen": settings.screen,
         "refract:metersPerUnit": scene.metres_per_unit,
-        "refract:rays": float(rays + session.rays),
+        "refract:rays": float(rays + ready.rays),
     }
     notices = scene.notices + camera_light(scene) + open_meshes(scene, settings.model) + glass_twice(scene, settings)
-    notices += session.notices
+    notices += ready.notices
     return Frame(width, height, planes, metadata, notices)
 
 
@@ -114,13 +117,13 @@ def glass_twice(scene: Scene, settings: RenderSettings) -> tuple[Notice, ...]:
 
 
 def _draw(
-    session: Session, scene: Scene, camera: Camera, settings: RenderSettings, size: tuple[int, int], work: Work
+    ready: Ready, scene: Scene, camera: Camera, settings: RenderSettings, size: tuple[int, int], work: Work
 ) -> tuple[dict[str, NDArray[np.float32]], int]:
     """All samples, averaged into planes. Returns the planes by AOV name, and rays traced."""
     tiles = tiles_of(*size, settings.tile_size)
     planes = new_planes(*size)
     rays, done = 0, 0.2
-    for step in Tree(session, scene, camera, settings, tiles, planes).passes():
+    for step in Tree(ready, scene, camera, settings, tiles, planes).passes():
         share = 0.8 * step.share
         rays += sum(work.run(step.draw, step.items, _told(work, done, share)))
         done += share
@@ -160,13 +163,13 @@ def glass_over(
             asked = replace(settings, samples=samples, tiers=tiers, screen="traced", exposure=0.0)
             if probe.captured is None:
                 nobody = np.full(len(scene.meshes) + len(scene.spheres), -1, np.int32)
-                session, seen = Session(world, bvh, empty_table([], [], camera, False), nobody, 0, ()), scene
+                ready, seen = Ready(world, bvh, empty_table([], [], camera, False), nobody, 0, ()), scene
             else:
                 seen = _part_of(scene, seen_things(scene, probe))
-                session = prepare_bare(seen, camera, quiet)
+                ready = prepare_bare(seen, camera, quiet)
             side, rays = texels.shape[1], 0
             for face in range(len(texels)):
-                planes, traced = _draw(session, seen, face_camera(probe, face), asked, (side, side), quiet)
+                planes, traced = _draw(ready, seen, face_camera(probe, face), asked, (side, side), quiet)
                 depth = planes["Z"] * scene.metres_per_unit
                 paste_face(texels[face], planes["mask"] > 0.0, planes["beauty"], depth, probe.background)
                 rays += traced
