@@ -134,11 +134,14 @@ def _draw(
 ) -> Drawn:
     """The picture, its reference, and whose pixel is whose."""
     from ..rendering.picture import render
+    from ..rendering.reuse import Session
+
+    session = Session()  # not for `find_owners`: its scene is another one, and would take the place of what is kept
 
     def draw(other: Scene, how: RenderSettings, what: str) -> Frame:
         stop_if(cancel, STATE)
         told = lambda share, stage: report.progress(share, f"{what}: {stage}")  # noqa: E731
-        return render(other, how, progress=told, cancel=cancel)
+        return render(other, how, progress=told, cancel=cancel, session=session)
 
     frame = draw(scene, settings, "picture")
     reference = draw(scene, reference_settings(settings, order.reference_samples), "reference")

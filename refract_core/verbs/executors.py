@@ -23,12 +23,15 @@ from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import RefractError, StageError, UsageError
 from ..progress import Report
 from ..scene import Notice, Scene
 from ..version import __version__
+
+if TYPE_CHECKING:
+    from ..rendering.reuse import Session
 
 _ADDRESS = re.compile(r"dask://([^\s/:]+|\[[0-9A-Fa-f:.]+\]):(\d{1,5})/?")
 CONNECT_SECONDS = 10
@@ -311,6 +314,8 @@ class _Opened:
     path: str
     scenes: dict[Any, Scene] = field(default_factory=dict)
     """the one read last"""
+    sessions: list[Session] = field(default_factory=list)
+    """the one that its pictures share; none before the first picture"""
 
 
 @dataclass(frozen=True)
@@ -334,6 +339,15 @@ class Bench:
                 self.opened.scenes.clear()
                 self.opened.scenes[key] = scene
         return scene
+
+    def session(self) -> Session:
+        """What keeps parts of pictures of this stage, of this order alone, and ends with it."""
+        from ..rendering.reuse import Session
+
+        with _reading:
+            if not self.opened.sessions:
+                self.opened.sessions.append(Session())
+        return self.opened.sessions[0]
 
     def _renamed(self, notice: Notice) -> Notice:
         here, there = self.opened.path, self.sent.stage

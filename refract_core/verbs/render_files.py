@@ -22,6 +22,7 @@ from .override import OverrideError, Overrides, check_overrides, override, overr
 
 if TYPE_CHECKING:
     from ..images.frame import Frame
+    from ..rendering.reuse import Session
 
 COMPLEXITIES = ("low", "medium", "high", "veryhigh")
 _STATE = "no unfinished file was left"
@@ -138,12 +139,14 @@ Tell = Callable[[Sequence[Notice]], None]
 
 
 def _render_here(stage: Any, shots: Sequence[_Shot], tell: Tell, report: Report, cancel: Callable[[], bool]) -> None:
+    from ..rendering.reuse import Session
     from ..usd.stage import scene_from_stage
 
     read = partial(scene_from_stage, stage)
+    session = Session() if len(shots) > 1 else None
     for done, shot in enumerate(shots):
         started = time.perf_counter()
-        frame = _draw(read, shot, tell, _frame_progress(report, done, len(shots)), cancel)
+        frame = _draw(read, shot, tell, _frame_progress(report, done, len(shots)), cancel, session)
         stop_if(cancel, _STATE)
         frame.save(shot.path, aovs=shot.aovs, color_correction=shot.color_correction)
         _say_done(report, shot, frame.width, frame.height, time.perf_counter() - started)
@@ -155,11 +158,13 @@ def _draw(
     tell: Tell,
     progress: Callable[[float, str], None],
     cancel: Callable[[], bool],
+    session: Session | None,
 ) -> Frame:
     """Read the stage at the shot's time and render it.
 
     Args:
         read: `scene_from_stage` of a stage.
+        session: of all shots of that stage that are drawn here; None where this is the only one.
     """
     from ..rendering.picture import render
 
@@ -176,7 +181,7 @@ def _draw(
     if shot.first:
         tell(_stale(changed, scene, settings))
     stop_if(cancel, _STATE)
-    frame = render(scene, settings, progress=progress, cancel=cancel)
+    frame = render(scene, settings, progress=progress, cancel=cancel, session=session)
     tell(frame.notices)
     return replace(frame, metadata={**frame.metadata, **override_notes(shot.materials)})
 
@@ -216,7 +221,8 @@ def _picture(bench: Bench, shot: _Shot) -> _Picture:
     """One frame, on a worker."""
     started = time.perf_counter()
     notices: dict[Notice, None] = {}
-    frame = _draw(bench.read, shot, lambda some: notices.update(dict.fromkeys(some)), _unheard, bench.cancel)
+    tell = lambda some: notices.update(dict.fromkeys(some))  # noqa: E731
+    frame = _draw(bench.read, shot, tell, _unheard, bench.cancel, bench.session())
     data = file_bytes(lambda path: frame.save(path, aovs=shot.aovs, color_correction=shot.color_correction), shot.path)
     return _Picture(data, frame.width, frame.height, tuple(notices), time.perf_counter() - started)
 
