@@ -20,7 +20,7 @@ from refract_core.images.layouts import arrange
 from refract_core.images.pictures import display, read_texture, write_frame
 from refract_core.images.srgb import srgb_encode
 from refract_core.progress import Report
-from refract_core.rendering.session import capture_probes
+from refract_core.rendering.ready import capture_probes
 from refract_core.scene import Cubemap
 from refract_core.verbs.bake_probes import BakeOrder, bake_probes
 

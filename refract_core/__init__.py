@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from .errors import Cancelled, EmbreeError, ImageError, RefractError, SceneError, StageError, UsageError
     from .images.frame import Frame
     from .rendering.picture import render
-    from .rendering.reuse import Session
+    from .rendering.session import Session
     from .scene import Notice, Scene
     from .settings import RenderSettings
     from .usd.stage import load_stage
@@ -64,7 +64,7 @@ _ROOMS = {
     "RenderSettings": "settings",
     "Scene": "scene",
     "SceneError": "errors",
-    "Session": "rendering.reuse",
+    "Session": "rendering.session",
     "StageError": "errors",
     "UsageError": "errors",
     "load_stage": "usd.stage",

@@ -89,7 +89,7 @@ def _tell(notices: tuple[Notice, ...] | list[Notice], say: Say, limits: Mapping[
 
 def _render(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[str, int], say: Say) -> Any:
     from refract_core.rendering.picture import render
-    from refract_core.rendering.session import choose_camera
+    from refract_core.rendering.ready import choose_camera
     from refract_core.usd.settings import read_settings
     from refract_core.usd.stage import open_stage, scene_from_stage
     from refract_core.verbs.render_files import chosen_settings

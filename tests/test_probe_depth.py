@@ -18,7 +18,7 @@ from refract_core.kernels.lanes import by_address
 from refract_core.probes.depth import meet_depths
 from refract_core.probes.lookup import ProbeTable
 from refract_core.probes.volumes import INFINITE_DISTANCE
-from refract_core.rendering.session import Ready, capture_probes
+from refract_core.rendering.ready import Ready, capture_probes
 from refract_core.scene import Mesh, Model, Probe, Scene, Sphere
 
 F64 = NDArray[np.float64]

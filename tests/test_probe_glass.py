@@ -30,7 +30,7 @@ from test_probes import directions, look, probe
 
 import refract_core as rc
 from refract_core.rendering.picture import glass_over
-from refract_core.rendering.session import Ready, prepare
+from refract_core.rendering.ready import Ready, prepare
 from refract_core.rendering.work import Work
 from refract_core.scene import Camera, Material, Mesh, Model, Scene, Sphere
 from refract_core.settings import RenderSettings

@@ -24,7 +24,7 @@ from scenes import (
     where,
 )
 
-from refract_core.rendering.session import capture_probes
+from refract_core.rendering.ready import capture_probes
 from refract_core.scene import Cubemap, LightKind, Model, Probe, Sphere, Volume
 
 BALL = Sphere("/ball", (0.0, 0.0, 0.0), 0.7, 0)

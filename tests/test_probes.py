@@ -30,7 +30,7 @@ from refract_core.kernels.compile import kernel
 from refract_core.kernels.lanes import by_address
 from refract_core.probes.lookup import ProbeTable, cube_at
 from refract_core.probes.plan import in_order
-from refract_core.rendering.session import Ready, prepare
+from refract_core.rendering.ready import Ready, prepare
 from refract_core.rendering.work import Work
 from refract_core.scene import Model, Probe, Scene, Sphere, Volume
 from refract_core.settings import RenderSettings

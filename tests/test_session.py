@@ -24,10 +24,10 @@ import refract_core as rc
 from refract_core.errors import Cancelled, SceneError
 from refract_core.images.frame import Frame
 from refract_core.progress import Report
-from refract_core.rendering import session as room
+from refract_core.rendering import ready as room
 from refract_core.rendering.picture import glass_over
-from refract_core.rendering.reuse import same
-from refract_core.rendering.session import Ready, prepare
+from refract_core.rendering.ready import Ready, prepare
+from refract_core.rendering.session import same
 from refract_core.rendering.work import Work
 from refract_core.scene import Environment, LightKind, Model, Param, Scene, Source, Sphere
 from refract_core.settings import QUALITIES, RenderSettings

@@ -26,7 +26,7 @@ from ..view.pyramid import Screen, blur_level, fill_depth_levels, new_blur_scrat
 from ..view.quiet import SIDE as QUIET_SIDE
 from ..view.quiet import Care, QuietScratch, quiet_tile
 from .integrator import Pass
-from .session import Session, is_rough
+from .ready import Ready, is_rough
 from .work import tiles_of
 
 _SKY_STEP = 3.0
@@ -50,7 +50,7 @@ class Tree:
     """
 
     def __init__(
-        self, session: Session, scene: Scene, camera: Camera, settings: RenderSettings, tiles: list[Tile],
+        self, session: Ready, scene: Scene, camera: Camera, settings: RenderSettings, tiles: list[Tile],
         planes: Planes,
     ) -> None:  # fmt: skip
         height, width = planes.mask.shape

@@ -29,8 +29,8 @@ from ..view.planes import by_name, finish_of, finish_tile, new_planes
 from ..world.embree import Bvh
 from ..world.tables import World, prim_of
 from .branching import Tree, needs_compiling
-from .reuse import Session
-from .session import PROBE_SAMPLES, Ready, choose_camera, prepare, prepare_bare
+from .ready import PROBE_SAMPLES, Ready, choose_camera, prepare, prepare_bare
+from .session import Session
 from .work import Cancel, Progress, Work, tiles_of, working
 
 

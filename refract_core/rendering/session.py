@@ -1,264 +1,141 @@
-"""A scene made ready: tables, the BVH they point into, and the pictures of the probes that serve a picture."""
+"""What pictures need before their first ray, kept from one to the next: `Session`.
+
+A part is kept beside a copy of all it was made from, and used again where that is equal, byte for byte. So nothing is
+ever stale, whatever was done to an array in between; and comparing is eight times as fast as a digest that could be
+trusted (docs/decisions/one-of-each-kind.md).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
-from concurrent.futures import Executor
-from dataclasses import replace
-from typing import Any, NamedTuple
+import struct
+import threading
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from contextlib import contextmanager
+from copy import deepcopy
+from dataclasses import fields, is_dataclass
+from itertools import count
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import UsageError
-from ..kernels.lanes import by_address
-from ..probes.capture import Over, Run, cubemap_of, fill_table
-from ..probes.lookup import ProbeTable, empty_table
-from ..probes.plan import Entry, Plan, plan_capture, plan_picture
-from ..scene import Camera, Cubemap, Notice, Param, Probe, Scene
-from ..settings import RenderSettings
-from ..world import environment, textures
-from ..world.embree import Bvh
-from ..world.lights import pack_lights
-from ..world.tables import World, pack_geometry, pack_materials, primvar_slots, world_of
-from . import reuse
-from .work import Cancel, Progress, Work, working
+from ..errors import Cancelled
+from .work import Cancel
 
-PROBE_SAMPLES = 16
-"""Most rays per probe texel; more samples of the picture do not make probes finer."""
+P = TypeVar("P")
+
+_CHUNK = 1 << 17
+"""Words that are compared at once: they stay in the cache, and what differs early is known early."""
+_WAIT = 0.2  # [s] between two questions whether to go on waiting
 
 
-class Ready(NamedTuple):
-    """A scene made ready: tables, and the BVH they point into."""
+class Part(NamedTuple, Generic[P]):
+    """Something that was made, and what it was made from."""
 
-    world: World
-    """by address"""
-    bvh: Bvh
-    probes: ProbeTable
-    thing_probe: NDArray[np.int32]
-    rays: int
-    notices: tuple[Notice, ...]
+    number: int
+    """Never given twice in a session: what is made from a part names it by this."""
+    made: P
+    source: Any
+    """its own copy"""
 
 
-Session = Ready  # as `branching` still calls it; the `Session` that keeps things is `reuse.Session`
+class Session:
+    """Parts of pictures, for the next one: tables and hierarchy of the geometry, textures, sky, pictures of probes.
 
+        session = rc.Session()
+        for scene in scenes:
+            rc.render(scene, settings, session=session)
 
-def choose_camera(scene: Scene, name: str) -> Camera:
-    """The camera by path or name; the scene's own choice where `name` is ''. Raises UsageError."""
-    if not scene.cameras:
-        raise UsageError("the scene has no camera; the reader always gives one, so add one to Scene.cameras")
-    if not name:
-        return scene.cameras[0]
-    for camera in scene.cameras:
-        if name in (camera.path, camera.path.rpartition("/")[2]):
-            return camera
-    known = ", ".join(camera.path for camera in scene.cameras)
-    raise UsageError(f"--camera {name}: the stage has no such camera; it has {known}")
+    Pictures are the same with and without it, bit by bit. A part is made anew where anything it is made from differs,
+    be it another record or other numbers in the same array; arrays are compared whole, so scenes may be changed in
+    place between two pictures, though not while one is drawn.
 
-
-def prepare(
-    scene: Scene,
-    camera: Camera,
-    settings: RenderSettings,
-    work: Work,
-    over: Callable[[World, Bvh], Over] | None = None,
-    session: reuse.Session | None = None,
-) -> Ready:
-    """Pack tables, build the BVH, capture probes.
-
-    Args:
-        over: given the packed scene, what draws the glass that probes see (`picture.glass_over`); None leaves it out.
-        session: has what earlier pictures needed, and keeps what this one does.
+    Of each kind it keeps one part, that of the last picture that needed any, beside a copy of the arrays it was made
+    from. What it drops is freed when the last picture that uses it is done. Threads may share a session: they make
+    parts one after the other, and draw side by side.
     """
-    proxies = "screen" in settings.tiers and settings.screen == "proxy"
-    chosen = plan_picture(scene, camera, drawn="probe" in settings.tiers, proxies=proxies)
-    # Where pixels are made from corners, most of them are seen four times, however many samples edges take.
-    samples = min(max(1, settings.samples // 4) if settings.by_corners else settings.samples, PROBE_SAMPLES)
-    if session is None:
-        return _prepare(scene, camera, chosen, is_rough(scene), samples, work, (0.1, 0.2), over)
-    with session.held(work.cancel):
-        return _from_parts(session, scene, camera, chosen, settings, samples, work, (0.1, 0.2), over)
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+        self._numbers = count()
+        self._kept: dict[str, dict[Hashable, Part[Any]]] = {}
+
+    def clear(self) -> None:
+        """Keep nothing of what there is."""
+        with self._lock:
+            self._kept.clear()
+
+    @contextmanager
+    def held(self, cancel: Cancel) -> Iterator[None]:
+        """Be the one that makes parts. Raises Cancelled where `cancel` says so while another one is at it."""
+        while not self._lock.acquire(timeout=_WAIT):
+            if cancel():
+                raise Cancelled("cancelled; nothing was written")
+        try:
+            yield
+        finally:
+            self._lock.release()
+
+    def part(self, kind: str, source: Any, make: Callable[[], P], *, copied: bool = False) -> Part[P]:
+        """The one part of a kind: as it is, where it was made from the same, else made and kept.
+
+        Args:
+            source: all that `make` reads: records, tuples, dictionaries, arrays, texts and numbers.
+            copied: its arrays are those of another part's `source`, which nobody else has.
+        """
+        return self.parts(kind, {kind: (source, make)}, copied=copied)[0]
+
+    def parts(
+        self, kind: str, wanted: Mapping[Hashable, tuple[Any, Callable[[], P]]], *, copied: bool = False
+    ) -> list[Part[P]]:
+        """Parts of a kind, as `part`; others of that kind are dropped, unless none is wanted.
+
+        Args:
+            wanted: by name, under which one is looked for: what it is made from, and what makes it.
+            copied: as in `part`.
+
+        Returns:
+            In the order of `wanted`.
+        """
+        if not wanted:
+            return []
+        known = self._kept.pop(kind, {})
+        found = {name: part for name, part in known.items() if name in wanted and same(part.source, wanted[name][0])}
+        self._kept[kind] = found
+        del known  # what is dropped is gone before something takes its place
+        for name, (source, make) in wanted.items():
+            if name not in found:
+                found[name] = Part(next(self._numbers), make(), source if copied else deepcopy(source))
+        return [found[name] for name in wanted]
 
 
-def prepare_bare(scene: Scene, camera: Camera, work: Work) -> Ready:
-    """A scene made ready to be drawn without any probes."""
-    return _prepare(scene, camera, plan_capture(scene, []), False, 1, work, (0.0, 0.0))
+def same(a: Any, b: Any) -> bool:
+    """Equal to the last bit: NaN is itself, and -0.0 is not 0.0. Records and containers by what is in them."""
+    if a is b:  # of the two, one is nobody's but the session's
+        return True
+    if type(a) is not type(b):
+        return False
+    if isinstance(a, np.ndarray):
+        return a.dtype == b.dtype and a.shape == b.shape and not a.dtype.hasobject and _same_bytes(a, b)
+    if isinstance(a, np.generic):
+        return a.tobytes() == b.tobytes()
+    if is_dataclass(a):
+        return all(same(getattr(a, field.name), getattr(b, field.name)) for field in fields(a))
+    if isinstance(a, tuple | list):
+        return len(a) == len(b) and all(map(same, a, b))
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(value, b[name]) for name, value in a.items())
+    if isinstance(a, float):
+        return struct.pack("<d", a) == struct.pack("<d", b)
+    return bool(a == b)
 
 
-def _prepare(
-    scene: Scene,
-    camera: Camera,
-    chosen: Plan,
-    rough: bool,
-    samples: int,
-    work: Work,
-    span: tuple[float, float],
-    over: Callable[[World, Bvh], Over] | None = None,
-) -> Ready:
-    geometry, bvh, slots = pack_geometry(scene, chosen.captured_sets)
-    world = by_address(
-        world_of(
-            geometry,
-            pack_materials(scene.materials, slots),
-            textures.pack(scene.textures),
-            pack_lights(scene, camera.world_from_camera[:3, 3]),
-            environment.pack(scene.environment),
-        )
-    )
-    entries = chosen.entries
-    table = empty_table([e.probe for e in entries], [e.drawn for e in entries], camera, rough)
-    work.progress(span[0], "probes")
-    rays = fill_table(table, entries, world, _runner(work, span), samples, over and over(world, bvh))
-    return Ready(world, bvh, table, chosen.thing_probe, rays, chosen.notices)
-
-
-def _runner(work: Work, span: tuple[float, float]) -> Run:
-    """How probes are drawn, and what share of the picture that is said to be."""
-    return lambda function, items: work.run(
-        function, items, lambda share: work.progress(span[0] + (span[1] - span[0]) * share, "probes")
-    )
-
-
-# --- with parts that are there ------------------------------------------------------------------------------------
-
-
-class _Capture(NamedTuple):
-    """The picture of one probe, in a table of its own."""
-
-    table: ProbeTable
-    rays: int
-
-
-def _from_parts(
-    session: reuse.Session,
-    scene: Scene,
-    camera: Camera,
-    chosen: Plan,
-    settings: RenderSettings,
-    samples: int,
-    work: Work,
-    span: tuple[float, float],
-    over: Callable[[World, Bvh], Over] | None,
-) -> Ready:
-    """As `_prepare`, part by part. The tables of materials and lights are made anew: they cost less than to compare."""
-    hierarchy = session.part(
-        "geometry", _geometry_source(scene, chosen), lambda: pack_geometry(scene, chosen.captured_sets)
-    )
-    images = session.part("textures", scene.textures, lambda: textures.pack(scene.textures))
-    sky = session.part("environment", scene.environment, lambda: environment.pack(scene.environment))
-    geometry, bvh, slots = hierarchy.made
-    materials = pack_materials(scene.materials, slots)
-    lights = pack_lights(scene, camera.world_from_camera[:3, 3])
-    world = by_address(world_of(geometry, materials, images.made, lights, sky.made))
-
-    rough = is_rough(scene)
-    drawn = [entry for entry in chosen.entries if entry.drawn]
-    seen = session.part("seen", _seen(*hierarchy.source), lambda: None, copied=True).number if drawn else None
-    opaque = tuple(material for material in scene.materials if not material.refractive)
-    shown = seen, images.number, sky.number, tuple(lights), opaque, rough, samples
-    # A probe that sees glass is drawn as a picture is, from the scene itself; how the work is cut up never changes it.
-    plain = replace(settings, jobs=0, tile_size=64)
-    glassy = hierarchy.number, plain, scene.materials, scene.bounds, scene.metres_per_unit
-    wanted: dict[Hashable, tuple[Any, Callable[[], _Capture]]] = {}
-    for k, entry in enumerate(drawn):
-        alone = empty_table([entry.probe], [True], camera, rough)
-        by_eye = alone.eye if entry.probe.planar else None
-        width = (span[1] - span[0]) / len(drawn)
-        run = _runner(work, (span[0] + k * width, span[0] + (k + 1) * width))
-
-        def capture(entry: Entry = entry, alone: ProbeTable = alone, run: Run = run) -> _Capture:
-            return _Capture(alone, fill_table(alone, [entry], world, run, samples, over and over(world, bvh)))
-
-        # Nobody promises that two probes have two paths.
-        same_path = sum(before.probe.path == entry.probe.path for before in drawn[:k])
-        source = entry, shown, glassy if entry.probe.sees_glass else None, by_eye
-        wanted[entry.probe.path, same_path] = source, capture
-    work.progress(span[0], "probes")
-    captures = [part.made for part in session.parts("probes", wanted)]
-    table = _joined(chosen.entries, captures, camera, rough)
-    return Ready(world, bvh, table, chosen.thing_probe, sum(one.rays for one in captures), chosen.notices)
-
-
-def _joined(entries: Sequence[Entry], captures: Sequence[_Capture], camera: Camera, rough: bool) -> ProbeTable:
-    """One table of all probes, as `fill_table` would have filled it.
-
-    Args:
-        captures: of the entries that are drawn, in their order.
-    """
-    table = empty_table([e.probe for e in entries], [e.drawn for e in entries], camera, rough)
-    left = iter(captures)
-    for k, entry in enumerate(entries):
-        if entry.drawn:
-            _paste(table, k, next(left).table)
-        else:
-            table.weight[k] = 0.0
-    return table
-
-
-def _geometry_source(scene: Scene, chosen: Plan) -> Any:
-    """All that `pack_geometry` reads."""
-    kinds = tuple((material.refractive, material.cutout) for material in scene.materials)
-    return scene.meshes, scene.spheres, kinds, primvar_slots(scene.materials), tuple(chosen.captured_sets)
-
-
-def _seen(meshes: Any, spheres: Any, kinds: Any, _slots: Any, sets: Any) -> Any:
-    """What probes may see of a `_geometry_source`: not what primvars say about glass, such as how thick it is."""
-    glass = np.array([refractive for refractive, _cutout in kinds], bool)
-
-    def seen(thing: Any, materials: Any) -> Any:
-        return replace(thing, primvars={}) if glass[materials].all() else thing
-
-    return [seen(mesh, mesh.materials) for mesh in meshes], [seen(ball, ball.material) for ball in spheres], kinds, sets
-
-
-def _paste(table: ProbeTable, k: int, alone: ProbeTable) -> None:
-    """Put the picture of one probe into a table of many, which has the same levels for it."""
-    first = int(table.first[k, 0])
-    table.texels[first : first + len(alone.texels)] = alone.texels
-    if (start := int(table.depths.first[k])) >= 0:
-        size = len(alone.depths.inverse)
-        table.depths.inverse[start : start + size] = alone.depths.inverse
-        table.depths.torn[start : start + size] = alone.depths.torn
-        table.depths.nearest[k] = alone.depths.nearest[0]
-
-
-# --- for a file ---------------------------------------------------------------------------------------------------
-
-
-def capture_probes(
-    scene: Scene,
-    probes: Sequence[Probe],
-    *,
-    samples: int = 16,
-    jobs: int = 0,
-    progress: Progress | None = None,
-    cancel: Cancel | None = None,
-    executor: Executor | None = None,
-) -> list[Cubemap]:
-    """Take the pictures of cube probes, with all their levels, as `refract bake probes` does.
-
-    Args:
-        probes: of the scene, or made by hand; what they have for a `cubemap` is ignored. None may be planar.
-        samples: rays per texel, 1 .. 4096.
-        jobs: threads; 0 means all cores.
-
-    Raises:
-        UsageError: a probe is planar: its picture depends on the camera.
-        Cancelled: `cancel` said so.
-    """
-    for probe in probes:
-        if probe.planar:
-            raise UsageError(f"{probe.path}: a planar probe's picture depends on the camera; leave it to the render")
-    with working(executor, jobs, progress, cancel) as work:
-        chosen = plan_capture(scene, [replace(probe, cubemap=None) for probe in probes])
-        ready = _prepare(scene, choose_camera(scene, ""), chosen, True, samples, work, (0.0, 1.0))
-    return [cubemap_of(ready.probes, k) for k in range(len(probes))]
-
-
-def is_rough(scene: Scene) -> bool:
-    """Some refractive material may be rough, so the colour pyramid will be read above level 0."""
-    for material in scene.materials:
-        source = material.inputs[Param.ROUGHNESS]
-        if material.refractive and (source.value[0] > 0.0 or source.texture >= 0 or source.primvar):
-            return True
-    return False
+def _same_bytes(a: NDArray[Any], b: NDArray[Any]) -> bool:
+    """Two arrays of the same type and shape."""
+    left, right = (np.ascontiguousarray(each).reshape(-1).view(np.uint8) for each in (a, b))
+    whole = len(left) // 8 * 8
+    if (left[whole:] != right[whole:]).any():
+        return False
+    left, right = left[:whole].view(np.uint64), right[:whole].view(np.uint64)
+    steps = range(0, len(left), _CHUNK)
+    return all(bool((left[at : at + _CHUNK] == right[at : at + _CHUNK]).all()) for at in steps)

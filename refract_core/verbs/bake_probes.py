@@ -18,7 +18,7 @@ from ..images.cubemaps import read_notes, write_cubemap
 from ..images.layouts import LAYOUTS
 from ..probes.digest import probe_digest
 from ..progress import Report
-from ..rendering.session import capture_probes
+from ..rendering.ready import capture_probes
 from ..scene import Cubemap, Probe, Scene
 from ..usd.layers.write import check_out, save
 from ..usd.probes.pictures import MADE, Baked, earlier, instanced, is_packed, layer_of, own_texture, read_asset
@@ -62,7 +62,7 @@ class BakeOrder:
 _STATE = "textures that were finished stay, and OUT is as it was"
 
 Capture = Callable[..., list[Cubemap]]
-"""`rendering.session.capture_probes`, or what stands in for it."""
+"""`rendering.ready.capture_probes`, or what stands in for it."""
 
 
 class Task(NamedTuple):

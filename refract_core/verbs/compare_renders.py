@@ -134,7 +134,7 @@ def _draw(
 ) -> Drawn:
     """The picture, its reference, and whose pixel is whose."""
     from ..rendering.picture import render
-    from ..rendering.reuse import Session
+    from ..rendering.session import Session
 
     session = Session()  # not for `find_owners`: its scene is another one, and would take the place of what is kept
 

@@ -31,7 +31,7 @@ from ..scene import Notice, Scene
 from ..version import __version__
 
 if TYPE_CHECKING:
-    from ..rendering.reuse import Session
+    from ..rendering.session import Session
 
 _ADDRESS = re.compile(r"dask://([^\s/:]+|\[[0-9A-Fa-f:.]+\]):(\d{1,5})/?")
 CONNECT_SECONDS = 10
@@ -342,7 +342,7 @@ class Bench:
 
     def session(self) -> Session:
         """What keeps parts of pictures of this stage, of this order alone, and ends with it."""
-        from ..rendering.reuse import Session
+        from ..rendering.session import Session
 
         with _reading:
             if not self.opened.sessions:

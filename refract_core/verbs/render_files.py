@@ -22,7 +22,7 @@ from .override import OverrideError, Overrides, check_overrides, override, overr
 
 if TYPE_CHECKING:
     from ..images.frame import Frame
-    from ..rendering.reuse import Session
+    from ..rendering.session import Session
 
 COMPLEXITIES = ("low", "medium", "high", "veryhigh")
 _STATE = "no unfinished file was left"
@@ -139,7 +139,7 @@ Tell = Callable[[Sequence[Notice]], None]
 
 
 def _render_here(stage: Any, shots: Sequence[_Shot], tell: Tell, report: Report, cancel: Callable[[], bool]) -> None:
-    from ..rendering.reuse import Session
+    from ..rendering.session import Session
     from ..usd.stage import scene_from_stage
 
     read = partial(scene_from_stage, stage)
