@@ -662,4 +662,17 @@ def test_tiles_and_threads_change_no_bit_of_any_plane() -> None:
             np.testing.assert_array_equal(other[name], plane, err_msg=f"{name} in tiles of {tile}")
 
 
+def test_where_confidence_is_low_the_picture_is_off_and_by_about_that() -> None:
+    """The fifth of the glass that is trusted least has the largest error, and 1 - confidence is its order."""
+    what = furnished()
+    good = draw(what, 160, 120, tiers=("ray", "sky"), **GOOD)
+    truth = draw(what, 160, 120, tiers=("ray", "sky"), **PLAIN)
+    inside = good["mask"] > 0.5
+    doubt, off = 1.0 - good["confidence"][inside], np.abs(shown(good) - shown(truth)).max(-1)[inside]
+    fifths = np.array_split(np.argsort(doubt, kind="stable"), 5)
+    errors = np.array([off[fifth].mean() for fifth in fifths])
+    assert errors[4] > 1.5 * errors[:3].max()
+    assert 0.3 < doubt[fifths[4]].mean() / errors[4] < 3.0
+
+
 ALL_TIERS: dict[str, Any] = {"tiers": ("screen", "probe", "ray", "sky")}

@@ -22,7 +22,7 @@ from ..kernels.vec import Vec, add, dot, length, lerp, mul, normalize, row, scal
 from ..view.camera import Tile, View, pixel_point, pixel_ray
 from ..view.gbuffer import OpaqueLayer
 from ..view.planes import Planes
-from ..world.shading import is_painted_alone, load_surface, paint
+from ..world.shading import entering, is_painted_alone, load_surface, paint
 from ..world.surface import Hit, Interaction, Ray, corners_of, interaction, kept_hit
 from ..world.tables import World
 from .answers import MOST_ANSWERS, Answers, add_direct, add_sky, body_light, keep_answers
@@ -48,8 +48,8 @@ _PER_TOLERANCE = 0.8
 """Samples, to the power of 3/4, for each tolerance that corners differ by."""
 _PAINTED = 0.2
 """Times the tolerance, below which a texture is not looked at between the corners."""
-_SMOOTH_PIXEL, _ALL_SAMPLES = -1, 2
-"""The set of samples of a pixel that takes none, and of one that takes all."""
+_ALL_SAMPLES = 2
+"""The set of samples of a pixel that takes all."""
 _EDGE_ON = 0.1
 """Cosine below which a surface is seen too slantingly to say where it is elsewhere."""
 _MOST_TAPS = 8
@@ -82,6 +82,8 @@ class CornerScratch(NamedTuple):
     """pixels of the patch that are edges"""
     sets: I32_1D
     """which samples each of them takes"""
+    contrast: F64_1D
+    """of its corners"""
     places: I32_1D
     """row of `Refining.offsets` of each slot"""
     times: F64_1D
@@ -103,7 +105,7 @@ class CornerScratch(NamedTuple):
     def fresh() -> CornerScratch:
         """All of it at zero."""
         return CornerScratch(
-            np.zeros(PATCH * PATCH, np.int32), np.zeros(PATCH * PATCH, np.int32),
+            np.zeros(PATCH * PATCH, np.int32), np.zeros(PATCH * PATCH, np.int32), np.zeros(PATCH * PATCH),
             np.zeros(CELL, np.int32), np.zeros(CELL),
             np.zeros(4, np.int64), np.zeros(4, np.int64),
             np.zeros((2, 3)), np.zeros((4, 3)), np.zeros((4, 3)), np.zeros((3, 3)),
@@ -149,9 +151,10 @@ def corner_tile(
     edges = 0
     for j in range(height):
         for i in range(width):
-            wanted = _draw_pixel(scratch, own, world, refining, view, planes, x0 + i, y0 + j, j * _ROW + i)
-            if wanted != _SMOOTH_PIXEL:
-                own.edges[edges], own.sets[edges] = j * PATCH + i, wanted
+            contrast = _draw_pixel(scratch, own, world, refining, view, planes, x0 + i, y0 + j, j * _ROW + i)
+            if contrast > refining.tolerance:
+                own.edges[edges], own.sets[edges] = j * PATCH + i, _set_for(refining, contrast)
+                own.contrast[edges] = contrast
                 edges += 1
     _draw_edges(scratch, own, world, asking, rules, view_ray, refining, view, planes, x0, y0, edges)
     return scratch.packet.tally[0] + scratch.work.packet.tally[0]
@@ -227,12 +230,12 @@ def _keep_opaque(
 def _draw_pixel(
     scratch: TreeScratch, own: CornerScratch, world: World, refining: Refining, view: View, planes: Planes,
     x: int, y: int, slot: int,
-) -> int:  # fmt: skip
-    """Make a pixel of its corners. Of an edge, for which nothing is done, which set of samples it takes; else -1."""
+) -> float:  # fmt: skip
+    """Make a pixel of its corners, and return their contrast; where it is over the tolerance nothing is done."""
     answers = scratch.answers
     for k in range(4):
         if answers.filled[_corner(slot, k)] > MOST_ANSWERS:
-            return _ALL_SAMPLES
+            return math.inf
         own.used[k] = 0
         for c in range(3):
             own.alone[k, c] = own.shared[k, c] = 0.0
@@ -258,10 +261,10 @@ def _draw_pixel(
             put(own.alone, k, add(row(own.alone, k), light))
             put(own.light, answers.side[r], add(row(own.light, answers.side[r]), scale(light, 0.25)))
     contrast = _contrast(scratch, own, refining, slot)
-    if contrast > refining.tolerance:
-        return _set_for(refining, contrast)
-    _write_pixel(scratch, own, planes, refining.samples, x, y, slot, view.orthographic)
-    return _SMOOTH_PIXEL
+    if contrast <= refining.tolerance:
+        _write_pixel(scratch, own, planes, refining.samples, x, y, slot, view.orthographic)
+        planes.confidence[y, x] *= 1.0 - _expected_error(contrast, 4)
+    return contrast
 
 
 @inlined
@@ -360,9 +363,11 @@ def _filter(scratch: TreeScratch, own: CornerScratch, world: World) -> None:
     emissive, albedo = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     first = kept_hit(answers.hits, found[0])
     alone = is_painted_alone(world, first.material)
+    share = (1.0, 1.0, 1.0)
     if alone:  # what it mirrors is the same all over the pixel
         wo = scale(row(answers.direction, found[0]), -1.0)
         load_surface(block, 0, interaction(world.geometry, first, Ray(a, wo), 0.0), world, wo)
+        share = entering(block, 0)
     for j in range(down):
         t = (j + 0.5) / down
         for i in range(across):
@@ -372,7 +377,7 @@ def _filter(scratch: TreeScratch, own: CornerScratch, world: World) -> None:
             hit = _moved(world, kept_hit(answers.hits, near), sub(p, row(answers.point, near)))
             wo = scale(row(answers.direction, near), -1.0)
             if alone:
-                shines, sends = paint(block, 0, Interaction(hit, p, wo, wo, _SHARPER * step), world)
+                shines, sends = paint(Interaction(hit, p, wo, wo, _SHARPER * step), world, share)
             else:
                 load_surface(block, 0, interaction(world.geometry, hit, Ray(p, wo), _SHARPER * step), world, wo)
                 shines, sends = row(block.emissive, 0), row(block.albedo, 0)
@@ -427,6 +432,12 @@ def _contrast(scratch: TreeScratch, own: CornerScratch, refining: Refining, slot
         missing = cell.missing[_corner(slot, k)]
         least, all_missing = min(least, missing), max(all_missing, missing)
     return max(most, all_missing - least)
+
+
+@inlined
+def _expected_error(contrast: float, samples: int) -> float:
+    """By how much a pixel is off, to the eye, that is made of so many samples or corners: 0 .. 1."""
+    return min(1.0, _PER_TOLERANCE * contrast / samples**0.75)
 
 
 @inlined
@@ -501,6 +512,10 @@ def _draw_edges(
                 count = 0
     if count > 0:
         _draw_samples(scratch, own, world, asking, rules, refining, view, planes, count)
+    for k in range(edges):
+        taken = refining.sets[own.sets[k] + 1] - refining.sets[own.sets[k]]
+        x, y = x0 + own.edges[k] % PATCH, y0 + own.edges[k] // PATCH
+        planes.confidence[y, x] *= 1.0 - _expected_error(own.contrast[k], taken)
 
 
 @inlined

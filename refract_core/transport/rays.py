@@ -79,7 +79,7 @@ class Rays(NamedTuple):
     inner: I32_1D
     """1 on the inner stretch of a model, from its entry to its exit; OUT_OF_BODY once it has passed the real wall"""
     leave_point: F64_2D
-    """shape (N, 3): where an inner stretch ends [m]"""
+    """shape (N, 3): where an inner stretch ends [m]; this and the next are of no use elsewhere"""
     leave_direction: F64_2D
     """shape (N, 3): and which way the ray goes on from there"""
     pixel: I32_1D
@@ -130,8 +130,9 @@ def copy_ray(to: Rays, i: int, rays: Rays, j: int) -> None:
         to.weight[i, c] = rays.weight[j, c]
         to.clear[i, c] = rays.clear[j, c]
         to.normal[i, c] = rays.normal[j, c]
-        to.leave_point[i, c] = rays.leave_point[j, c]
-        to.leave_direction[i, c] = rays.leave_direction[j, c]
+    if rays.inner[j] != 0:
+        put(to.leave_point, i, row(rays.leave_point, j))
+        put(to.leave_direction, i, row(rays.leave_direction, j))
     to.start[i], to.begun[i], to.end[i] = rays.start[j], rays.begun[j], rays.end[j]
     to.blur[i], to.roughness[i], to.path[i] = rays.blur[j], rays.roughness[j], rays.path[j]
     to.travelled[i] = rays.travelled[j]

@@ -183,15 +183,16 @@ def is_painted_alone(world: World, m: int) -> bool:
 
 
 @inlined
-def paint(block: Block, lane: int, at: Interaction, world: World) -> tuple[Vec, Vec]:
-    """Emission and albedo at another place of the surface in a lane, of a material that `is_painted_alone`."""
-    metallic = 0.0
-    if not world.materials.specular_workflow[at.hit.material]:
-        metallic = share_input(world, at, Param.METALLIC.value)
+def entering(block: Block, lane: int) -> Vec:
+    """The share of light that the surface in a lane does not mirror."""
     cosine = abs(dot(row(block.ns, lane), row(block.wo, lane)))
-    entering = _entering(row(block.f0, lane), block.roughness[lane], cosine)
-    base = scale(color_input(world, at, Param.DIFFUSE.value), 1.0 - metallic)
-    return color_input(world, at, Param.EMISSIVE.value), mul(base, entering)
+    return _entering(row(block.f0, lane), block.roughness[lane], cosine)
+
+
+@inlined
+def paint(at: Interaction, world: World, share: Vec) -> tuple[Vec, Vec]:
+    """Emission and albedo of a material that `is_painted_alone`, so is no metal, and lets that share of light in."""
+    return color_input(world, at, Param.EMISSIVE.value), mul(color_input(world, at, Param.DIFFUSE.value), share)
 
 
 @inlined
