@@ -53,6 +53,8 @@ SLOTS = 33 * 33
 _LEAVES = 256
 _STRONG = 0.1
 """Weight of a leaf above which its light is worth rays of its own."""
+_FULL = 0.4
+"""Weight from which on it is worth all of them; below it sends fewer, in proportion."""
 
 # What a ray of a packet has come to.
 _ENDED, _MET, _PASSED_OUT, _NO_RAY = 0, 1, 2, 3
@@ -445,7 +447,7 @@ def _load_query(
     query.embedded[lane] = 1 if inside or direct else 0
     strongest = max(leaves.weight[k, 0], leaves.weight[k, 1], leaves.weight[k, 2])
     query.strong[lane] = 1 if strongest > _STRONG else 0
-    query.rays[lane] = max(1, math.ceil(times * min(1.0, strongest / _STRONG)))
+    query.rays[lane] = max(1, math.ceil(times * min(1.0, strongest / _FULL)))
     query.by_proxy[lane] = 1 if asking.method == PROXY and leaves.side[k] != MIRRORED_SIDE else 0
 
 
