@@ -54,7 +54,8 @@ _LEAVES = 256
 _STRONG = 0.1
 """Weight of a leaf above which its light is worth rays of its own."""
 _FULL = 0.4
-"""Weight from which on it is worth all of them; below it sends fewer, in proportion."""
+"""Weight from which on it is worth all of them; below it sends fewer, in proportion. A cone, which sees much, is worth
+them as soon as it is strong."""
 
 # What a ray of a packet has come to.
 _ENDED, _MET, _PASSED_OUT, _NO_RAY = 0, 1, 2, 3
@@ -447,7 +448,8 @@ def _load_query(
     query.embedded[lane] = 1 if inside or direct else 0
     strongest = max(leaves.weight[k, 0], leaves.weight[k, 1], leaves.weight[k, 2])
     query.strong[lane] = 1 if strongest > _STRONG else 0
-    query.rays[lane] = max(1, math.ceil(times * min(1.0, strongest / _FULL)))
+    full = _FULL if leaves.blur[k] <= 0.0 else _STRONG
+    query.rays[lane] = max(1, math.ceil(times * min(1.0, strongest / full)))
     query.by_proxy[lane] = 1 if asking.method == PROXY and leaves.side[k] != MIRRORED_SIDE else 0
 
 
