@@ -48,11 +48,11 @@ def perform(kind: str, stage: str, out: str, settings: Mapping[str, Any], limits
     try:
         return _VERBS[kind](stage, out, settings, limits, say)
     except StageError as error:
+        raise Problem("stage-invalid", _public(str(error))) from None
+    except UsageError as error:
         if str(error).startswith("camera ") and settings.get("camera"):
             raise Problem("invalid-settings", _public(str(error)),
                           errors=[{"pointer": "/camera", "detail": "the stage has no such camera"}]) from None
-        raise Problem("stage-invalid", _public(str(error))) from None
-    except UsageError as error:
         raise Problem("invalid-settings", _public(str(error))) from None
     except (SceneError, ImageError) as error:
         raise Problem("stage-invalid", _public(str(error))) from None

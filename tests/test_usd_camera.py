@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pxr import Gf, UsdGeom
 from scene_reading import CUBE, F64, read, stage_of, texts, to_stage
 
-from refract_core.errors import StageError
+from refract_core.errors import UsageError
 from refract_core.scene import Camera, Scene
 from refract_core.usd.camera import frame_everything
 from refract_core.usd.stage import scene_from_stage
@@ -177,9 +177,9 @@ def test_an_asked_for_camera_comes_first_by_path_or_name() -> None:
 
 
 def test_an_unknown_camera_is_an_error_that_lists_the_others() -> None:
-    with pytest.raises(StageError, match=r"'nope' does not exist; the stage has /X/deep, /a, /b"):
+    with pytest.raises(UsageError, match=r"'nope' does not exist; the stage has /X/deep, /a, /b"):
         read(SEVERAL, camera="nope")
-    with pytest.raises(StageError, match="none at all"):
+    with pytest.raises(UsageError, match="none at all"):
         read(CUBE(), camera="nope")
 
 

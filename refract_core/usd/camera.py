@@ -7,7 +7,7 @@ import math
 import numpy as np
 from pxr import Gf, Usd, UsdGeom, UsdRender
 
-from ..errors import StageError
+from ..errors import UsageError
 from ..scene import F64, Camera, Notice
 
 FOCAL_LENGTH = 50.0
@@ -147,7 +147,7 @@ def choose_camera(
     main_cam, the first by path, and one made to frame everything.
 
     Raises:
-        StageError: where `wanted` is no camera of the stage.
+        UsageError: where `wanted` is no camera of the stage.
     """
     chosen = _choose(stage, cameras, wanted, notices)
     if chosen is None:
@@ -191,7 +191,7 @@ def _asked_for(cameras: tuple[Camera, ...], wanted: str, notices: list[Notice]) 
     matches = [camera for camera in cameras if wanted in (camera.path, _name(camera))]
     if not matches:
         known = ", ".join(_paths(cameras)) or "none at all"
-        raise StageError(f"camera '{wanted}' does not exist; the stage has {known}")
+        raise UsageError(f"camera '{wanted}' does not exist; the stage has {known}")
     if len(matches) > 1:
         text = f"{len(matches)} cameras are named {wanted}; the first by path is used"
         notices.append(Notice(matches[0].path, text))

@@ -94,7 +94,8 @@ def load_stage(
         camera: prim path or name of the camera that `Scene.cameras` begins with; '' chooses one
 
     Raises:
-        StageError: the stage cannot be opened or read, or has no such camera.
+        StageError: the stage cannot be opened or read.
+        UsageError: it has no such camera.
     """
     return scene_from_stage(open_stage(path), time_code=time_code, purposes=purposes, camera=camera)
 
