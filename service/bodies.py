@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import difflib
 import json
 import os
 import secrets
 import shutil
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from pydantic import ValidationError
 from starlette.datastructures import UploadFile
@@ -20,6 +21,9 @@ from .limits import Limits
 from .models import StageOnly
 from .problems import Problem
 from .tasks import pointer
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 _MAGIC = {b"#usda ": ".usda", b"PXR-USDC": ".usdc", b"PK\x03\x04": ".usdz"}
@@ -148,11 +152,30 @@ def check(model: type[StageOnly], value: Any) -> StageOnly:
         return model.model_validate(value)
     except ValidationError as error:
         errors = [
-            {"pointer": "".join(f"/{pointer(str(step)[:100])}" for step in one["loc"]), "detail": one["msg"][:300]}
+            {
+                "pointer": "".join(f"/{pointer(str(step)[:100])}" for step in one["loc"]),
+                "detail": _wrong(model, one)[:300],
+            }
             for one in error.errors(include_url=False, include_context=False, include_input=False)[:20]
         ]
-        text = f"{len(errors)} of the settings are not valid, the first at '{errors[0]['pointer']}'"
+        first = errors[0]
+        text = f"{first['pointer']}: {first['detail']}" + (f"; and {len(errors) - 1} more" if len(errors) > 1 else "")
         raise Problem("invalid-settings", text, errors=errors) from None
+
+
+def _wrong(model: type[StageOnly], one: ErrorDetails) -> str:
+    """What is wrong with a field, and what may be there instead: both ends of a number's range, where pydantic tells
+    the one that was missed, and the nearest name to one that is not known."""
+    fields = model.model_json_schema()["properties"]
+    name = str(one["loc"][0]) if len(one["loc"]) == 1 else ""
+    if one["type"] == "extra_forbidden":
+        near = difflib.get_close_matches(name[:100], fields, 1)
+        return "is not known" + (f"; did you mean {near[0]}?" if near else "; leave it out, or see /docs")
+    if one["type"] in ("greater_than_equal", "less_than_equal") and name in fields:
+        for kind in fields[name].get("anyOf", ()):
+            if "minimum" in kind and "maximum" in kind:
+                return f"must be between {kind['minimum']} and {kind['maximum']}"
+    return str(one["msg"])
 
 
 def invalid(where: str, detail: str) -> Problem:

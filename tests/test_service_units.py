@@ -78,6 +78,28 @@ def test_models_are_strict_and_point_at_the_field(settings: Any, pointer: str) -
     assert [one["pointer"] for one in caught.value.errors] == [pointer]
 
 
+@pytest.mark.parametrize("wrong", [{"tolerance": -1}, {"tolerance": 2}, {"light_samples": 0}, {"light_samples": 5000}])
+def test_a_number_out_of_range_is_told_both_ends_of_it(wrong: dict[str, float]) -> None:
+    (name, value), = wrong.items()
+    with pytest.raises(Problem) as of_service:
+        check(models.Render, wrong)
+    with pytest.raises(UsageError) as of_engine:
+        RenderSettings(**{name: value})  # type: ignore[arg-type]
+    low, high = (float(word) for word in str(of_engine.value).rpartition("between ")[2].split(" and "))
+    told = of_service.value.errors[0]["detail"].removeprefix("must be between ").split(" and ")
+    assert [float(word) for word in told] == [low, high]
+    assert of_service.value.detail == f"/{name}: {of_service.value.errors[0]['detail']}"
+
+
+def test_a_field_that_is_not_known_is_told_the_nearest_one() -> None:
+    with pytest.raises(Problem) as caught:
+        check(models.Render, {"tolerence": 0.1, "xyz": 1})
+    assert [one["detail"].partition("; ")[2] for one in caught.value.errors] == [
+        "did you mean tolerance?", "leave it out, or see /docs"
+    ]  # fmt: skip
+    assert caught.value.detail.endswith("; and 1 more")
+
+
 def test_a_whole_number_is_a_number() -> None:
     assert check(models.Render, {"exposure": 1, "samples": 4}).model_dump(exclude_none=True) == {
         "exposure": 1.0, "samples": 4
