@@ -176,7 +176,11 @@ def _read(
     cameras = choose_camera(stage, time, read_cameras(stage, time, **frame), camera, bounds, notices)
     lights, environment = read_lights(stage, time, purposes=purposes, **frame)
     every = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
-    lit = any(prim.HasAPI(UsdLux.LightAPI) for prim in every) or _glows(tables, meshes, spheres)
+    glow, dull = _glow(tables, meshes, spheres)
+    if glow and dull and not lights and environment is None:
+        text = "what glows does not light other things, and nothing else lights them, so they are black; add a light"
+        notices.append(Notice("/", f"{text} ({some_of(dull)})"))
+    lit = bool(glow) or any(prim.HasAPI(UsdLux.LightAPI) for prim in every)
     return Scene(
         meshes=meshes,
         materials=tuple(tables.materials),
@@ -195,16 +199,21 @@ def _read(
     )
 
 
-def _glows(tables: Tables, meshes: tuple[Mesh, ...], spheres: tuple[Sphere, ...]) -> bool:
-    """Something that is drawn emits light: its emissive colour is not black, or a picture or primvar drives it."""
+def _glow(tables: Tables, meshes: tuple[Mesh, ...], spheres: tuple[Sphere, ...]) -> tuple[list[str], list[str]]:
+    """Paths of what is drawn and emits light, for its emissive colour is not black, or a picture or primvar drives it;
+    and of what shows nothing but the light that falls on it."""
 
     def emits(material: Material) -> bool:
         source = material.inputs[Param.EMISSIVE]
         driven = source.texture >= 0 or source.primvar
         return max(source.scale[:3]) > 0.0 or max(source.bias[:3]) > 0.0 if driven else max(source.value[:3]) > 0.0
 
-    used = {int(m) for mesh in meshes for m in np.unique(mesh.materials)} | {ball.material for ball in spheres}
-    return any(emits(tables.materials[m]) for m in used)
+    glow = [emits(material) for material in tables.materials]
+    dull = [not (glows or material.refractive) for glows, material in zip(glow, tables.materials, strict=True)]
+    drawn = [(mesh.path, np.unique(mesh.materials).tolist()) for mesh in meshes]
+    drawn += [(ball.path, [ball.material]) for ball in spheres]
+    glowing = [path for path, used in drawn if any(glow[m] for m in used)]
+    return glowing, [path for path, used in drawn if any(dull[m] for m in used)]
 
 
 def _drawn(placed: list[Placed], centre: F64) -> tuple[tuple[Mesh, ...], tuple[Sphere, ...]]:
