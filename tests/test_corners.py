@@ -38,6 +38,7 @@ from scenes import (
 )
 
 from refract_core.scene import Environment, LightKind, Material, Mesh, Model, Scene, Source, Sphere, Texture, Volume
+from refract_core.settings import named_settings
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -660,6 +661,34 @@ def test_tiles_and_threads_change_no_bit_of_any_plane() -> None:
         other = draw(what, 84, 72, tile_size=tile, jobs=jobs, **GOOD, **ALL_TIERS)
         for name, plane in whole.items():
             np.testing.assert_array_equal(other[name], plane, err_msg=f"{name} in tiles of {tile}")
+
+
+def test_brushed_metal_is_quieter_the_better_the_quality() -> None:
+    walls, kinds, textures = checker_room()
+    brushed = material("/brushed", METALLIC=1.0, ROUGHNESS=0.3, DIFFUSE=0.9)
+    what = scene(walls, [*kinds, brushed], [Sphere("/ball", (0, 0, 0), 0.8, len(kinds))], textures=textures)
+    truth = shown(draw(what, 64, 64, **PLAIN))
+    noise = [rms(shown(draw(what, 64, 64, **named_settings(quality))) - truth) for quality in ("draft", "good", "best")]
+    assert noise[0] > noise[1] > noise[2]
+    assert noise[2] < 0.02
+
+
+@pytest.mark.parametrize("width", [0.55, 0.8])
+def test_wires_thinner_than_a_pixel_are_not_broken(width: float) -> None:
+    """Over half a pixel wide, so slanting that they pass between corners for many rows: every row has all of each."""
+    size, fov = 64, 1.0
+    pixel = 2 * fov / size
+    wires = [
+        quad(f"/wire{i}", [(x, 0.5, 9), (x + width * pixel, 0.5, 9), (x + width * pixel, 0.5, -9), (x, 0.5, -9)], 1)
+        for i, x in enumerate(np.linspace(-0.8, 0.8, 6))
+    ]
+    turn = turned((0, 1, 0), 3)
+    wires = [replace(wire, points=(wire.points @ turn.T).astype(np.float32)) for wire in wires]
+    shining = [material("/white", EMISSIVE=1.0, DIFFUSE=0.0), material("/black", DIFFUSE=0.0, IOR=1.0)]
+    what = scene([quad("/floor", FLOOR), *wires], shining, cameras=(above(0.0, fov),))
+    lost = 1.0 - draw(what, size, size, **GOOD)["beauty"][..., 0]
+    assert lost.sum(1) == pytest.approx(6 * width / math.cos(math.radians(3)), rel=0.2)
+    assert lost.sum(1).mean() == pytest.approx(6 * width / math.cos(math.radians(3)), rel=0.03)
 
 
 def test_where_confidence_is_low_the_picture_is_off_and_by_about_that() -> None:

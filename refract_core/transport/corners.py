@@ -16,15 +16,17 @@ import numpy as np
 
 from ..kernels.arrays import F64_1D, F64_2D, I32_1D, I64_1D
 from ..kernels.compile import flag, inlined, kernel
-from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, put
+from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Scalars, put
 from ..kernels.sampling import Key
 from ..kernels.vec import Vec, add, dot, length, lerp, mul, normalize, row, scale, sub
 from ..view.camera import Tile, View, pixel_point, pixel_ray
-from ..view.gbuffer import OpaqueLayer
+from ..view.gbuffer import OpaqueLayer, add_view_ray
 from ..view.planes import Planes
+from ..world.embree import COHERENT, EVERYTHING, clear, has_hit
 from ..world.shading import entering, is_painted_alone, load_surface, paint
-from ..world.surface import Hit, Interaction, Ray, corners_of, interaction, kept_hit
+from ..world.surface import NOTHING, Hit, Interaction, Ray, corners_of, hit_in, interaction, kept_hit
 from ..world.tables import World
+from ..world.tracing import intersect_world
 from .answers import MOST_ANSWERS, Answers, add_direct, add_sky, body_light, keep_answers
 from .crossing import Rules
 from .pixels import add_glass, add_light, keep_glass, keep_place
@@ -78,6 +80,10 @@ class Refining(NamedTuple):
 class CornerScratch(NamedTuple):
     """What one thread needs besides a tree's."""
 
+    middle: I32_1D
+    """part that is seen in the middle of each pixel of the patch; NOTHING where there is none"""
+    far: Scalars
+    """T_FAR of the rays to the middles"""
     edges: I32_1D
     """pixels of the patch that are edges"""
     sets: I32_1D
@@ -105,6 +111,7 @@ class CornerScratch(NamedTuple):
     def fresh() -> CornerScratch:
         """All of it at zero."""
         return CornerScratch(
+            np.zeros(PATCH * PATCH, np.int32), np.zeros(LANES),
             np.zeros(PATCH * PATCH, np.int32), np.zeros(PATCH * PATCH, np.int32), np.zeros(PATCH * PATCH),
             np.zeros(CELL, np.int32), np.zeros(CELL),
             np.zeros(4, np.int64), np.zeros(4, np.int64),
@@ -148,10 +155,13 @@ def corner_tile(
         scratch, world, asking, rules, view_ray, opaque, x0, y0, width + 1, height + 1, refining.corner_rays
     )
     keep_answers(scratch.answers, False)
+    _look_in_middles(scratch, own, world, view, x0, y0, width, height)
     edges = 0
     for j in range(height):
         for i in range(width):
-            contrast = _draw_pixel(scratch, own, world, refining, view, planes, x0 + i, y0 + j, j * _ROW + i)
+            contrast = math.inf
+            if not _is_between(scratch, own.middle[j * PATCH + i], j * _ROW + i):
+                contrast = _draw_pixel(scratch, own, world, refining, view, planes, x0 + i, y0 + j, j * _ROW + i)
             if contrast > refining.tolerance:
                 own.edges[edges], own.sets[edges] = j * PATCH + i, _set_for(refining, contrast)
                 own.contrast[edges] = contrast
@@ -206,6 +216,7 @@ def _keep_opaque(
     put(cell.color, slot, light)
     cell.missing[slot] = 1.0 - opaque.color[y, x, 3]
     cell.chance[slot] = opaque.hits.chance[y, x]
+    cell.part[slot] = NOTHING if opaque.depth[y, x] == math.inf else opaque.hits.part[y, x]
     cell.z_depth[slot] = opaque.depth[y, x]
     put(cell.normal, slot, row(opaque.normal[y], x))
     if opaque.depth[y, x] == math.inf:
@@ -221,6 +232,35 @@ def _keep_opaque(
     emissive, albedo = row(hits.emissive[y], x), row(hits.albedo[y], x)
     irradiance, gloss = row(opaque.irradiance[y], x), row(opaque.gloss[y], x)
     add_direct(scratch.answers, slot, at, direction, emissive, albedo, irradiance, gloss)
+
+
+@inlined
+def _look_in_middles(
+    scratch: TreeScratch, own: CornerScratch, world: World, view: View, x0: int, y0: int, width: int, height: int
+) -> None:
+    """Find out which parts are seen in the middles of a patch's pixels: what is thin may pass between all corners."""
+    packet = scratch.packet
+    for by in range(0, height, BLOCK_HEIGHT):
+        for bx in range(0, width, BLOCK_WIDTH):
+            clear(packet)
+            for lane in range(LANES):
+                i, j = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
+                if i < width and j < height:
+                    own.middle[j * PATCH + i] = NOTHING
+                    own.far[lane] = add_view_ray(packet, view, lane, x0 + i, y0 + j, EVERYTHING)
+            intersect_world(packet, world, own.far, COHERENT)
+            for lane in range(LANES):
+                if has_hit(packet, lane):
+                    i, j = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
+                    own.middle[j * PATCH + i] = hit_in(packet, lane, world.geometry).part
+
+
+@inlined
+def _is_between(scratch: TreeScratch, part: int, slot: int) -> bool:
+    """What the middle of a pixel shows is seen in none of its corners."""
+    seen = scratch.cell.part
+    first_two = seen[_corner(slot, 0)] == part or seen[_corner(slot, 1)] == part
+    return not (first_two or seen[_corner(slot, 2)] == part or seen[_corner(slot, 3)] == part)
 
 
 # --- a pixel ------------------------------------------------------------------------------------------------------

@@ -27,7 +27,7 @@ from ..view.pyramid import Screen
 from ..view.screen import light_seen, screen_blurred, screen_march, screen_proxy
 from ..world.embree import OPAQUE, SCATTERED, Packet, clear, set_ray
 from ..world.environment import prefiltered
-from ..world.shading import LOBES, Block, gloss, load_hits, load_surface, nth, shade
+from ..world.shading import Block, gloss, load_hits, load_surface, nth, shade
 from ..world.surface import NOTHING, HitLanes, Ray, interaction, kept_hit
 from ..world.tables import World
 from ..world.tracing import intersect_world
@@ -72,6 +72,8 @@ class Query(NamedTuple):
     """1: much of its pixel's light comes this way, so that a ray of its own is worth its price"""
     rays: Words
     """that it sends to each light and to the sky, or into its cone"""
+    lobes: Words
+    """that a rough mirror sends, if it meets one"""
     by_proxy: Flags
     """1: it asks the screen by HDRP's proxy, and maps roughness as HDRP does"""
     width: Scalars
@@ -367,7 +369,7 @@ def _shade_met(query: Query, work: TierScratch, world: World) -> None:
             second.on[lane] = 1
             load_surface(second, lane, at, world, scale(d, -1.0))
             second.rays[lane] = query.rays[lane]
-            second.lobes[lane] = max(1, query.rays[lane] // LOBES)
+            second.lobes[lane] = query.lobes[lane]
     shade(second, work.third, work.packet, world, OPAQUE)
     for lane in range(LANES):
         if second.on[lane] != 0:

@@ -23,7 +23,7 @@ from ..view.camera import View, pixel_ray
 from ..world.embree import COHERENT, EVERYTHING, OPAQUE, SCATTERED, Packet, clear, has_hit, set_ray
 from ..world.environment import TEXEL_LUMINANCE, radiance
 from ..world.offsets import tie
-from ..world.shading import Block, gather, load_surface
+from ..world.shading import LOBES, Block, gather, load_surface
 from ..world.surface import NOTHING, HitLanes, Ray, hit_in, interaction, keep_hit, kept_hit
 from ..world.tables import World
 from ..world.tracing import intersect_world
@@ -97,6 +97,8 @@ class Cell(NamedTuple):
     """1 where the view ray met an interface, or is in a medium"""
     chance: I32_1D
     """1 where something that one of its rays met is there by chance, or is not"""
+    part: I32_1D
+    """of the first surface, glass or not; NOTHING where there is none"""
     z_depth: F64_1D
     """of the first surface [m]"""
     normal: F64_2D
@@ -148,7 +150,7 @@ def _new_cell(count: int) -> Cell:
     columns = {"color": 3, "refraction": 3, "reflection": 3, "weight": 3, "clear": 3, "tiers": 5, "normal": 3}
 
     def array(name: str) -> Any:
-        if name in ("x", "y", "sample", "entered", "glass", "chance"):
+        if name in ("x", "y", "sample", "entered", "glass", "chance", "part"):
             return np.zeros(count, np.int32)
         return np.zeros((count, columns[name])) if name in columns else np.zeros(count)
 
@@ -195,6 +197,7 @@ def clear_slot(cell: Cell, i: int) -> None:
         cell.tiers[i, k] = 0.0
     cell.missing[i] = cell.confidence[i] = cell.share[i] = cell.largest[i] = cell.path[i] = 0.0
     cell.entered[i] = cell.glass[i] = cell.chance[i] = 0
+    cell.part[i] = NOTHING
     cell.z_depth[i] = math.inf
     cell.thickness[i] = 0.0
 
@@ -318,6 +321,7 @@ def _meet_all(scratch: TreeScratch, world: World, view: View, rules: Rules, take
         if first:
             i = now.pixel[lane]
             cell.glass[i] = 1
+            cell.part[i] = hit.part
             cell.z_depth[i] = hit.t * dot(direction, row(view.axes, 2))
             cell.thickness[i] = meeting.thickness[lane]
             put(cell.normal, i, row(meeting.n, lane))
@@ -336,6 +340,7 @@ def _note_opaque(scratch: TreeScratch, world: World, view: View, lane: int) -> N
     """Where a view ray ends without having met any interface."""
     now, hit = scratch.now, kept_hit(scratch.met, lane)
     direction, i = row(now.direction, lane), now.pixel[lane]
+    scratch.cell.part[i] = hit.part
     scratch.cell.z_depth[i] = hit.t * dot(direction, row(view.axes, 2))
     at = interaction(world.geometry, hit, Ray(row(now.origin, lane), direction), 0.0)
     put(scratch.cell.normal, i, flip_towards(at.ng, scale(direction, -1.0)))
@@ -450,6 +455,8 @@ def _load_query(
     query.strong[lane] = 1 if strongest > _STRONG else 0
     full = _FULL if leaves.blur[k] <= 0.0 else _STRONG
     query.rays[lane] = max(1, math.ceil(times * min(1.0, strongest / full)))
+    # Those of a corner are one of four that a pixel has; samples, which come few at first, must not know less.
+    query.lobes[lane] = query.rays[lane] if alone else max(1, query.rays[lane] // LOBES)
     query.by_proxy[lane] = 1 if asking.method == PROXY and leaves.side[k] != MIRRORED_SIDE else 0
 
 

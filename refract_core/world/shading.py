@@ -578,7 +578,10 @@ def _add_mirrored(block: Block, second: Block, packet: Packet, world: World, mas
             _add_gloss_of_sky(second, lane, world, row(second.f0, lane), second.roughness[lane], 1.0)
             light = row(second.color, lane)
         elif world.environment.present:
-            light = prefiltered(world.environment, row(block.bounce, lane), 0.0)
+            # Each of many rays sees as much of the sky as it stands for (Colbert and Krivanek, GPU Gems 3, chapter 20).
+            share = block.bounced[lane]
+            wide = block.roughness[lane] / share**0.25 if share > 1 else 0.0
+            light = prefiltered(world.environment, row(block.bounce, lane), wide)
         else:
             continue
         cosine = min(1.0, max(1e-3, dot(row(block.ns, lane), row(block.wo, lane))))
