@@ -56,6 +56,7 @@ class Engine:
         *,
         progress: Callable[[float, str], None] | None = None,
         cancel: Callable[[], bool] | None = None,
+        session: rc.Session | None = None,
     ) -> rc.Frame:
         assert settings is not None
         assert progress is not None
