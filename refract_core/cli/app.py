@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from ..errors import RefractError, UsageError
+from ..settings import RenderSettings
 from ..progress import Report, reporting
 from ..version import __version__
 
@@ -76,7 +77,7 @@ def outcome(progress: str) -> Iterator[tuple[Report, Callable[[], bool]]]:
             try:
                 yield report, cancel
             except RefractError as error:
-                report.error(str(error))
+                report.error(_by_flag(str(error)))
                 raise typer.Exit(error.exit_code) from error
             except MemoryError as error:
                 report.error("out of memory; make the picture smaller, or the stage simpler")
@@ -85,8 +86,15 @@ def outcome(progress: str) -> Iterator[tuple[Report, Callable[[], bool]]]:
                 report.error("cancelled")
                 raise typer.Exit(CANCELLED) from error
     except UsageError as error:
-        typer.echo(f"error: {error}", err=True)
+        typer.echo(f"error: {_by_flag(str(error))}", err=True)
         raise typer.Exit(error.exit_code) from error
+
+
+def _by_flag(message: str) -> str:
+    """A message about a field of `RenderSettings`, with the flag that set it in the place of its name."""
+    name, _, rest = message.partition(" ")
+    known = name in RenderSettings.__dataclass_fields__ or name in ("quality", "preset")
+    return f"--{name.replace('_', '-')} {rest}" if known else message
 
 
 @contextmanager
