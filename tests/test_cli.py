@@ -223,7 +223,7 @@ def test_complexity_is_accepted_and_says_what_it_does_not_do(engine: Engine, tmp
     ("words", "message"),
     [
         (["a.png", "--samples", "0"], "--samples is 0"),
-        (["a.png", "-w", "0"], "image_width is 0"),
+        (["a.png", "-w", "0"], "--image-width is 0"),
         (["a.png", "--tiers", "screen,moon"], "moon"),
         (["a.png", "--tiers", ""], "tiers is empty"),
         (["a.png", "--screen", "guess"], "march, proxy, traced"),

@@ -12,8 +12,8 @@ from typing import Annotated, Any
 import typer
 
 from ..errors import RefractError, UsageError
-from ..settings import RenderSettings
 from ..progress import Report, reporting
+from ..settings import RenderSettings
 from ..version import __version__
 
 CANCELLED = 3
