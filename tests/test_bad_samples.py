@@ -142,7 +142,7 @@ def test_an_image_of_no_or_absurd_size_is_wrong_usage(flags: tuple[str, str], tm
     code, lines = refract(stage_path("no_camera"), tmp_path / "out.png", *flags)
     assert code == 2
     assert lines[-1].startswith("error: ")
-    assert "image_" in lines[-1]
+    assert "--image-" in lines[-1]
     assert flags[1] in lines[-1]
     assert not list(tmp_path.iterdir())
 
