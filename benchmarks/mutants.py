@@ -235,7 +235,7 @@ MUTANTS = (
     Mutant("edges of brushed metal have one lobe", "transport/tree.py",
            "query.rays[lane] if alone else max(", "1 if alone else max(", CORNERS),
     Mutant("an edge is as sure as any pixel", "transport/corners.py",
-           "1.0 - _expected_error(own.contrast[k], taken)", "1.0", CORNERS),
+           "1.0 - min(1.0, _expected_error(own.contrast[k], taken))", "1.0", CORNERS),
 )  # fmt: skip
 
 

@@ -8,6 +8,7 @@ import json
 import os
 import secrets
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
@@ -151,10 +152,11 @@ def check(model: type[StageOnly], value: Any) -> StageOnly:
     try:
         return model.model_validate(value)
     except ValidationError as error:
+        fields = model.model_json_schema()["properties"]
         errors = [
             {
                 "pointer": "".join(f"/{pointer(str(step)[:100])}" for step in one["loc"]),
-                "detail": _wrong(model, one)[:300],
+                "detail": _wrong(fields, one)[:300],
             }
             for one in error.errors(include_url=False, include_context=False, include_input=False)[:20]
         ]
@@ -163,10 +165,9 @@ def check(model: type[StageOnly], value: Any) -> StageOnly:
         raise Problem("invalid-settings", text, errors=errors) from None
 
 
-def _wrong(model: type[StageOnly], one: ErrorDetails) -> str:
+def _wrong(fields: Mapping[str, Any], one: ErrorDetails) -> str:
     """What is wrong with a field, and what may be there instead: both ends of a number's range, where pydantic tells
-    the one that was missed, and the nearest name to one that is not known."""
-    fields = model.model_json_schema()["properties"]
+    the one that was missed, and the nearest name to one that is not known. `fields`: JSON schemas by name."""
     name = str(one["loc"][0]) if len(one["loc"]) == 1 else ""
     if one["type"] == "extra_forbidden":
         near = difflib.get_close_matches(name[:100], fields, 1)

@@ -77,7 +77,7 @@ def outcome(progress: str) -> Iterator[tuple[Report, Callable[[], bool]]]:
             try:
                 yield report, cancel
             except RefractError as error:
-                report.error(_by_flag(str(error)))
+                report.error(_by_flag(error))
                 raise typer.Exit(error.exit_code) from error
             except MemoryError as error:
                 report.error("out of memory; make the picture smaller, or the stage simpler")
@@ -86,13 +86,16 @@ def outcome(progress: str) -> Iterator[tuple[Report, Callable[[], bool]]]:
                 report.error("cancelled")
                 raise typer.Exit(CANCELLED) from error
     except UsageError as error:
-        typer.echo(f"error: {_by_flag(str(error))}", err=True)
+        typer.echo(f"error: {_by_flag(error)}", err=True)
         raise typer.Exit(error.exit_code) from error
 
 
-def _by_flag(message: str) -> str:
-    """A message about a field of `RenderSettings`, with the flag that set it in the place of its name."""
+def _by_flag(error: RefractError) -> str:
+    """Its message; one about a field of `RenderSettings` with the flag that set it in the place of the name."""
+    message = str(error)
     name, _, rest = message.partition(" ")
+    if not isinstance(error, UsageError):  # those begin with a file or a prim, whatever it is called
+        return message
     known = name in RenderSettings.__dataclass_fields__ or name in ("quality", "preset")
     return f"--{name.replace('_', '-')} {rest}" if known else message
 

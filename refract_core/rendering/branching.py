@@ -50,11 +50,11 @@ class Tree:
     """
 
     def __init__(
-        self, session: Ready, scene: Scene, camera: Camera, settings: RenderSettings, tiles: list[Tile],
+        self, ready: Ready, scene: Scene, camera: Camera, settings: RenderSettings, tiles: list[Tile],
         planes: Planes,
     ) -> None:  # fmt: skip
         height, width = planes.mask.shape
-        self.session, self.camera, self.settings, self.tiles, self.planes = session, camera, settings, tiles, planes
+        self.ready, self.camera, self.settings, self.tiles, self.planes = ready, camera, settings, tiles, planes
         self.order = np.array([TIERS.index(t) for t in settings.tiers], np.int32)
         self.method = SCREEN_METHODS.index(settings.screen)
         model = int(BY_TOKEN[settings.model]) if settings.model else -1
@@ -99,7 +99,7 @@ class Tree:
                 rays, max(1, rays // few),
             )
         )  # fmt: skip
-        world, asking, samples_view = self.session.world, by_address(self._asking(corners)), by_address(view)
+        world, asking, samples_view = self.ready.world, by_address(self._asking(corners)), by_address(view)
         opaque, target = by_address(self.opaque), by_address(self.planes)
 
         def draw(tile: Tile) -> int:
@@ -113,7 +113,7 @@ class Tree:
         yield Pass(draw, tiles_of(width, height, PATCH), 0.7)
 
     def _sample_passes(self, view: View, sample: int, share: float) -> Iterator[Pass]:
-        world, asking, camera = self.session.world, by_address(self._asking(view)), by_address(view)
+        world, asking, camera = self.ready.world, by_address(self._asking(view)), by_address(view)
         opaque, target = by_address(self.opaque), by_address(self.planes)
 
         def look(tile: Tile) -> tuple[int, int]:
@@ -129,7 +129,7 @@ class Tree:
 
     def _quiet_passes(self, view: View, share: float) -> Iterator[Pass]:
         """Draw the corners' picture without glass."""
-        world, camera, opaque = self.session.world, by_address(view), by_address(self.opaque)
+        world, camera, opaque = self.ready.world, by_address(view), by_address(self.opaque)
         rays = self.settings.light_samples
         step = max(_SKY_STEP * self.settings.tolerance, _SKY_NOISE / rays**0.75)
         care = by_address(Care(rays, min(0.5, step)))
@@ -160,9 +160,9 @@ class Tree:
 
     def _asking(self, view: View) -> Asking:
         """Whom leaves ask, where `view` has drawn the opaque picture."""
-        session, traces = self.session, TIERS.index("ray") in self.order
+        ready, traces = self.ready, TIERS.index("ray") in self.order
         screen = Screen(view, *self.screen)
-        return Asking(self.order, self.method, traces, self.by_corners, screen, session.probes, session.thing_probe)
+        return Asking(self.order, self.method, traces, self.by_corners, screen, ready.probes, ready.thing_probe)
 
     def _levels(self) -> list[Callable[[], Any]]:
         """What makes the pyramids above the opaque picture, as far as somebody will read them."""

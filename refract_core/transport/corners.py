@@ -16,7 +16,7 @@ import numpy as np
 
 from ..kernels.arrays import F64_1D, F64_2D, I32_1D, I64_1D
 from ..kernels.compile import flag, inlined, kernel
-from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Scalars, put
+from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, put
 from ..kernels.sampling import Key
 from ..kernels.vec import Vec, add, dot, length, lerp, mul, normalize, row, scale, sub
 from ..view.camera import Tile, View, pixel_point, pixel_ray
@@ -82,8 +82,6 @@ class CornerScratch(NamedTuple):
 
     middle: I32_1D
     """part that is seen in the middle of each pixel of the patch; NOTHING where there is none"""
-    far: Scalars
-    """T_FAR of the rays to the middles"""
     edges: I32_1D
     """pixels of the patch that are edges"""
     sets: I32_1D
@@ -111,8 +109,8 @@ class CornerScratch(NamedTuple):
     def fresh() -> CornerScratch:
         """All of it at zero."""
         return CornerScratch(
-            np.zeros(PATCH * PATCH, np.int32), np.zeros(LANES),
-            np.zeros(PATCH * PATCH, np.int32), np.zeros(PATCH * PATCH, np.int32), np.zeros(PATCH * PATCH),
+            np.zeros(PATCH * PATCH, np.int32), np.zeros(PATCH * PATCH, np.int32), np.zeros(PATCH * PATCH, np.int32),
+            np.zeros(PATCH * PATCH),
             np.zeros(CELL, np.int32), np.zeros(CELL),
             np.zeros(4, np.int64), np.zeros(4, np.int64),
             np.zeros((2, 3)), np.zeros((4, 3)), np.zeros((4, 3)), np.zeros((3, 3)),
@@ -247,8 +245,8 @@ def _look_in_middles(
                 i, j = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
                 if i < width and j < height:
                     own.middle[j * PATCH + i] = NOTHING
-                    own.far[lane] = add_view_ray(packet, view, lane, x0 + i, y0 + j, EVERYTHING)
-            intersect_world(packet, world, own.far, COHERENT)
+                    scratch.far[lane] = add_view_ray(packet, view, lane, x0 + i, y0 + j, EVERYTHING)
+            intersect_world(packet, world, scratch.far, COHERENT)
             for lane in range(LANES):
                 if has_hit(packet, lane):
                     i, j = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
@@ -303,7 +301,7 @@ def _draw_pixel(
     contrast = _contrast(scratch, own, refining, slot)
     if contrast <= refining.tolerance:
         _write_pixel(scratch, own, planes, refining.samples, x, y, slot, view.orthographic)
-        planes.confidence[y, x] *= 1.0 - _expected_error(contrast, 4)
+        planes.confidence[y, x] *= 1.0 - min(1.0, _expected_error(contrast, 4))
     return contrast
 
 
@@ -476,20 +474,19 @@ def _contrast(scratch: TreeScratch, own: CornerScratch, refining: Refining, slot
 
 @inlined
 def _expected_error(contrast: float, samples: int) -> float:
-    """By how much a pixel is off, to the eye, that is made of so many samples or corners: 0 .. 1."""
-    return min(1.0, _PER_TOLERANCE * contrast / samples**0.75)
-
-
-@inlined
-def _set_for(refining: Refining, contrast: float) -> int:
-    """The smallest set of samples that is enough for an edge of this contrast.
+    """By how much a pixel is off, to the eye, that is made of so many samples or corners.
 
     The error of n samples spread evenly over a pixel that an edge cuts falls with n^(3/4) (Mitchell, "Consequences of
     stratified sampling in graphics", SIGGRAPH 1996).
     """
-    enough = (_PER_TOLERANCE * contrast / refining.tolerance) ** (4.0 / 3.0)
+    return _PER_TOLERANCE * contrast / samples**0.75
+
+
+@inlined
+def _set_for(refining: Refining, contrast: float) -> int:
+    """The smallest set of samples that is enough for an edge of this contrast."""
     for k in range(_ALL_SAMPLES):
-        if refining.sets[k + 1] - refining.sets[k] >= enough:
+        if _expected_error(contrast, refining.sets[k + 1] - refining.sets[k]) <= refining.tolerance:
             return k
     return _ALL_SAMPLES
 
@@ -555,7 +552,7 @@ def _draw_edges(
     for k in range(edges):
         taken = refining.sets[own.sets[k] + 1] - refining.sets[own.sets[k]]
         x, y = x0 + own.edges[k] % PATCH, y0 + own.edges[k] // PATCH
-        planes.confidence[y, x] *= 1.0 - _expected_error(own.contrast[k], taken)
+        planes.confidence[y, x] *= 1.0 - min(1.0, _expected_error(own.contrast[k], taken))
 
 
 @inlined

@@ -332,7 +332,8 @@ def _meet_all(scratch: TreeScratch, world: World, view: View, rules: Rules, take
             block.on[lane] = 1
             block.matte[lane] = 1 if meeting.opacity[lane] > 0.0 else 0
         cross(meeting, lane, now, rules)
-        put(scratch.block.fresnel, lane, row(meeting.reflectance, lane))  # of lamps, too, exactly
+        if scratch.block.on[lane] != 0:
+            put(scratch.block.fresnel, lane, row(meeting.reflectance, lane))  # of lamps, too, exactly
 
 
 @inlined

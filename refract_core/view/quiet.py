@@ -384,7 +384,7 @@ def _node(scratch: QuietScratch, world: World, care: Care, i: int, j: int, x0: i
             weight = row(scratch.weight, lane)
             seen, asked = along(seen, weight, scratch.free[lane]), add(asked, weight)
     scratch.rays[k] = 1
-    put(scratch.open, k, share_of_sky(seen, asked) if rays > 1 else seen)
+    put(scratch.open, k, share_of_sky(seen, asked, rays))
     return row(scratch.open, k)
 
 

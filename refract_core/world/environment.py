@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import SceneError
 from ..kernels.arrays import F32_2D, F32_3D, F64_1D, F64_2D, I16_1D, I16_2D, I64_2D
 from ..kernels.compile import inlined, kernel
-from ..kernels.vec import Vec, transform_direction
+from ..kernels.vec import Vec, row, transform_direction
 from ..scene import F32, F64, Environment
 
 MAX_RADIANCE = 1e30
@@ -221,14 +221,14 @@ def _resample(source: F32_3D, target: F32_3D) -> None:
     """Mean over the solid angle of each target texel, for any two sizes."""
     height, width = source.shape[0], source.shape[1]
     rows, columns = target.shape[0], target.shape[1]
-    for row in range(rows):
-        top, bottom = row * height / rows, (row + 1) * height / rows
+    for j in range(rows):
+        top, bottom = j * height / rows, (j + 1) * height / rows
         whole = math.cos(top * math.pi / height) - math.cos(bottom * math.pi / height)
-        target[row] = 0.0
+        target[j] = 0.0
         for y in range(int(top), min(math.ceil(bottom), height)):
             upper, lower = max(top, float(y)), min(bottom, y + 1.0)
             share = math.cos(upper * math.pi / height) - math.cos(lower * math.pi / height)
-            _add_row(source[y], share / whole, width / columns, target[row])
+            _add_row(source[y], share / whole, width / columns, target[j])
 
 
 @inlined
@@ -392,9 +392,8 @@ def _texel_pdf(table: EnvironmentTable, row: int, column: int) -> float:
 
 
 @inlined
-def _tint(table: EnvironmentTable, row: int, column: int) -> Vec:
-    texel = row * (table.column_cdf.shape[1] - 1) + column
-    return (np.float64(table.tint[texel, 0]), np.float64(table.tint[texel, 1]), np.float64(table.tint[texel, 2]))
+def _tint(table: EnvironmentTable, y: int, x: int) -> Vec:
+    return row(table.tint, y * (table.column_cdf.shape[1] - 1) + x)
 
 
 @inlined

@@ -325,10 +325,10 @@ def _gather_sky(block: Block, packet: Packet, world: World, mask: int) -> None:
         return
     most = 0
     for lane in range(LANES):
-        for c in range(3):
-            block.sky_seen[lane, c] = block.sky_asked[lane, c] = 0.0
         if block.on[lane] != 0 and block.matte[lane] != 0:
             most = max(most, block.rays[lane])
+            for c in range(3):
+                block.sky_seen[lane, c] = block.sky_asked[lane, c] = 0.0
     for k in range(most):
         clear(packet)
         for lane in range(LANES):
@@ -344,16 +344,17 @@ def _gather_sky(block: Block, packet: Packet, world: World, mask: int) -> None:
                     block.sky_asked[lane, c] += block.sky_weight[lane, c]
     for lane in range(LANES):
         if block.on[lane] != 0 and block.matte[lane] != 0:
-            if block.rays[lane] > 1:
-                put(block.sky_seen, lane, share_of_sky(row(block.sky_seen, lane), row(block.sky_asked, lane)))
+            share = share_of_sky(row(block.sky_seen, lane), row(block.sky_asked, lane), block.rays[lane])
+            put(block.sky_seen, lane, share)
             add_sky(block, lane, environment)
-        else:
-            put(block.sky_seen, lane, (1.0, 1.0, 1.0))
 
 
 @inlined
-def share_of_sky(seen: Vec, asked: Vec) -> Vec:
-    """The share of the sky that arrives, colour by colour: weights of the rays that got through over those of all."""
+def share_of_sky(seen: Vec, asked: Vec, times: int) -> Vec:
+    """The share of the sky that arrives, colour by colour: weights of the rays that got through over those of all; the
+    weight of one that is alone says it by itself (`add_sky_ray`)."""
+    if times == 1:
+        return seen
     return (
         seen[0] / asked[0] if asked[0] > 0.0 else 1.0,
         seen[1] / asked[1] if asked[1] > 0.0 else 1.0,
