@@ -37,6 +37,7 @@ from scenes import (
     wall_hit,
 )
 
+import refract_core as rc
 from refract_core.scene import Environment, LightKind, Material, Mesh, Model, Scene, Source, Sphere, Texture, Volume
 from refract_core.settings import named_settings
 
@@ -689,6 +690,31 @@ def test_wires_thinner_than_a_pixel_are_not_broken(width: float) -> None:
     lost = 1.0 - draw(what, size, size, **GOOD)["beauty"][..., 0]
     assert lost.sum(1) == pytest.approx(6 * width / math.cos(math.radians(3)), rel=0.2)
     assert lost.sum(1).mean() == pytest.approx(6 * width / math.cos(math.radians(3)), rel=0.03)
+
+
+def test_glass_that_the_eye_passes_costs_no_samples() -> None:
+    """An eye within a typed ball does not see that ball (hdrp: back faces refract nothing): no pixel is an edge for it."""
+    walls, kinds = constant_room(0.75)
+    around = Sphere("/around", (0.0, 0.0, 2.0), 0.4, len(kinds))
+    settings = rc.RenderSettings(image_width=64, image_height=64, jobs=1, tiers=("ray", "sky"), **GOOD)
+    bare, within = (
+        rc.render(scene(walls, [*kinds, glass(Model.SPHERE)], things), settings) for things in ([], [around])
+    )
+    np.testing.assert_allclose(within.planes["beauty"], bare.planes["beauty"], atol=1e-6)
+    assert within.metadata["refract:rays"] < 5 * bare.metadata["refract:rays"]
+
+
+def test_an_edge_that_only_its_middle_shows_is_not_given_up() -> None:
+    """A wire of glass that no corner sees: its pixels took every sample, so they are as sure as other edges are."""
+    size, fov = 64, 1.0
+    x = 0.25 * 2 * fov / size  # half a pixel wide, and as far from the corners on both sides as it can be
+    wire = [(x, 0.5, 9), (x + fov / size, 0.5, 9), (x + fov / size, 0.5, -9), (x, 0.5, -9)]
+    kinds = [material("/white", EMISSIVE=1.0, DIFFUSE=0.0), glass(Model.THIN)]
+    what = scene([quad("/floor", FLOOR), quad("/wire", wire, 1)], kinds, cameras=(above(0.0, fov),))
+    picture = draw(what, size, size, **GOOD)
+    seen = picture["mask"] > 0.1
+    assert seen.sum() == size
+    assert picture["confidence"][seen].min() > 0.3
 
 
 def test_where_confidence_is_low_the_picture_is_off_and_by_about_that() -> None:

@@ -162,7 +162,7 @@ def corner_tile(
                 contrast = _draw_pixel(scratch, own, world, refining, view, planes, x0 + i, y0 + j, j * _ROW + i)
             if contrast > refining.tolerance:
                 own.edges[edges], own.sets[edges] = j * PATCH + i, _set_for(refining, contrast)
-                own.contrast[edges] = contrast
+                own.contrast[edges] = contrast if contrast < math.inf else 1.0
                 edges += 1
     _draw_edges(scratch, own, world, asking, rules, view_ray, refining, view, planes, x0, y0, edges)
     return scratch.packet.tally[0] + scratch.work.packet.tally[0]
@@ -199,7 +199,9 @@ def _draw_corners(
         for i in range(columns):
             slot = j * _ROW + i
             if scratch.answers.filled[slot] == 0 and scratch.cell.glass[slot] == 0:  # it passed what glass it met
+                first = scratch.cell.part[slot]
                 _keep_opaque(scratch, world, view, opaque, x0 + i, y0 + j, slot)
+                scratch.cell.part[slot] = first
 
 
 @inlined

@@ -312,6 +312,8 @@ def _meet_all(scratch: TreeScratch, world: World, view: View, rules: Rules, take
             continue
         first = now.side[lane] == VIEW
         direction = row(now.direction, lane)
+        if first and now.met[lane] == 0:  # even what it passes: the ray to the pixel's middle sees that, too
+            cell.part[now.pixel[lane]] = hit.part
         wide = cell.spread[now.pixel[lane]] * (now.travelled[lane] + hit.t)
         at = interaction(world.geometry, hit, Ray(row(now.origin, lane), direction), wide)
         meet(meeting, lane, now, at, world, rules)
@@ -321,7 +323,6 @@ def _meet_all(scratch: TreeScratch, world: World, view: View, rules: Rules, take
         if first:
             i = now.pixel[lane]
             cell.glass[i] = 1
-            cell.part[i] = hit.part
             cell.z_depth[i] = hit.t * dot(direction, row(view.axes, 2))
             cell.thickness[i] = meeting.thickness[lane]
             put(cell.normal, i, row(meeting.n, lane))
@@ -341,7 +342,8 @@ def _note_opaque(scratch: TreeScratch, world: World, view: View, lane: int) -> N
     """Where a view ray ends without having met any interface."""
     now, hit = scratch.now, kept_hit(scratch.met, lane)
     direction, i = row(now.direction, lane), now.pixel[lane]
-    scratch.cell.part[i] = hit.part
+    if now.met[lane] == 0:
+        scratch.cell.part[i] = hit.part
     scratch.cell.z_depth[i] = hit.t * dot(direction, row(view.axes, 2))
     at = interaction(world.geometry, hit, Ray(row(now.origin, lane), direction), 0.0)
     put(scratch.cell.normal, i, flip_towards(at.ng, scale(direction, -1.0)))
