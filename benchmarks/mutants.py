@@ -221,7 +221,7 @@ MUTANTS = (
     Mutant("what a probe has said is taken for the surface's", "transport/answers.py",
            "query.color[lane, c] - share * known", "query.color[lane, c] - known", CORNERS),
     Mutant("nobody doubts a lamp", "view/quiet.py",
-           "scratch.found[j] != scratch.found[i]:", "scratch.found[j] > 1.0:", CORNERS),
+           "> _STEP_OF_LAMP:", "> 2.0:", CORNERS),
     Mutant("any cell of the sky is filled", "view/quiet.py",
            "high[2] - low[2]) > care.step:", "high[2] - low[2]) > 2.0:", CORNERS),
     Mutant("a hidden sun takes all colours along", "world/shading.py",

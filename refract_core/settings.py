@@ -12,20 +12,22 @@ from .models import MODELS as MODELS
 TIERS = ("screen", "ray", "probe", "sky")
 SCREEN_METHODS = ("march", "proxy", "traced")
 QUALITIES: dict[str, dict[str, Any]] = {
-    "draft": {"samples": 4, "tolerance": 0.1, "cut": 0.05, "light_samples": 16},
-    "good": {"samples": 16, "tolerance": 0.03, "cut": 0.02, "light_samples": 16},
-    "best": {"samples": 32, "tolerance": 0.015, "cut": 0.005, "light_samples": 64},
-    "reference": {"samples": 256, "tolerance": 0.0, "cut": 0.0005, "tiers": ("ray", "sky"), "max_layers": 32},
+    "draft": {"samples": 4, "tolerance": 0.1, "cut": 0.05, "light_samples": 16, "caustics": 0},
+    "good": {"samples": 16, "tolerance": 0.03, "cut": 0.02, "light_samples": 16, "caustics": 1 << 16},
+    "best": {"samples": 32, "tolerance": 0.015, "cut": 0.005, "light_samples": 64, "caustics": 1 << 18},
+    "reference": {"samples": 256, "tolerance": 0.0, "cut": 0.0005, "tiers": ("ray", "sky"), "max_layers": 32,
+                  "caustics": 1 << 21},
 }
 """What each level of quality stands for; each setting may also be chosen by its own name. The last one draws all
 samples of every pixel, and leaves out what the picture lends its glass, and what probes do."""
 PRESETS: dict[str, dict[str, Any]] = {
-    "hdrp": {"screen": "proxy", "tiers": ("screen", "probe", "sky"), "max_layers": 1},
-    "arm": {"model": "single", "tiers": ("probe", "sky"), "max_layers": 1},
+    "hdrp": {"screen": "proxy", "tiers": ("screen", "probe", "sky"), "max_layers": 1, "caustics": 0},
+    "arm": {"model": "single", "tiers": ("probe", "sky"), "max_layers": 1, "caustics": 0},
 }
 """Settings that make other renderers' pictures."""
 PURPOSES = ("default", "render", "proxy", "guide")
 MAX_PIXELS = 1 << 28
+MAX_PHOTONS = 1 << 26
 
 
 def named_settings(quality: str = "", preset: str = "") -> dict[str, Any]:
@@ -70,6 +72,9 @@ class RenderSettings:
     """Refractive surfaces that a ray may enter before it sees no more glass, 1 .. 32; 1 is HDRP."""
     cut: float = 0.02
     """Weight below which a branch of light is not followed for itself, but given to its stronger sibling, 0 .. 1."""
+    caustics: int = 1 << 16
+    """Photons that bring light through traced glass, and off it, to what is opaque, 0 .. 67108864. 0: light goes
+    straight through glass on its way, as it does through panes and all other models."""
     exposure: float = 0.0
     """Stops added to the camera's own exposure, -64 .. 64."""
     purposes: tuple[str, ...] = ("default", "render")
@@ -97,6 +102,7 @@ class RenderSettings:
         _in_range("light_samples", self.light_samples, 1, 4096)
         _in_range("max_layers", self.max_layers, 1, 32)
         _in_range("cut", self.cut, 0.0, 1.0)
+        _in_range("caustics", self.caustics, 0, MAX_PHOTONS)
         _in_range("tolerance", self.tolerance, 0.0, 1.0)
         _in_range("jobs", self.jobs, 0, 4096)
         _in_range("tile_size", self.tile_size, 1, 65536)

@@ -33,7 +33,8 @@ _QUOTES = (
 _UNITS = ("Z", "thickness", "path_length", "layers")
 """Planes that are not between 0 and 1: their PNG is scaled, and says by how much."""
 _SETTINGS = ("camera", "image_width", "image_height", "quality", "preset", "samples", "tolerance", "light_samples",
-             "cut", "tiers", "screen", "model", "max_layers", "exposure", "camera_light", "purposes")  # fmt: skip
+             "caustics", "cut", "tiers", "screen", "model", "max_layers", "exposure", "camera_light",
+             "purposes")  # fmt: skip
 
 
 def perform(kind: str, stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[str, int], say: Say) -> Any:

@@ -203,8 +203,8 @@ def scene(
 
 
 def draw(what: rc.Scene, width: int = 64, height: int = 64, **settings: Any) -> dict[str, F32]:
-    """Planes of a one-sample picture on one thread unless told otherwise."""
-    chosen = {"samples": 1, "jobs": 1, "tiers": ("ray", "sky"), **settings}
+    """Planes of a one-sample picture without caustics, on one thread, unless told otherwise."""
+    chosen = {"samples": 1, "jobs": 1, "tiers": ("ray", "sky"), "caustics": 0, **settings}
     return rc.render(what, rc.RenderSettings(image_width=width, image_height=height, **chosen)).planes
 
 

@@ -701,7 +701,7 @@ def test_glass_that_the_eye_passes_costs_no_samples() -> None:
         rc.render(scene(walls, [*kinds, glass(Model.SPHERE)], things), settings) for things in ([], [around])
     )
     np.testing.assert_allclose(within.planes["beauty"], bare.planes["beauty"], atol=1e-6)
-    assert within.metadata["refract:rays"] < 5 * bare.metadata["refract:rays"]
+    assert float(within.metadata["refract:rays"]) < 5 * float(bare.metadata["refract:rays"])
 
 
 def test_an_edge_that_only_its_middle_shows_is_not_given_up() -> None:

@@ -36,7 +36,7 @@ from refract_core.verbs.render_files import Order, render_files
 from refract_core.world import environment, textures
 
 SAMPLES = Path(__file__).parents[1] / "usd_samples" / "good"
-SMALL = RenderSettings(image_width=24, image_height=16, samples=4, jobs=1)
+SMALL = RenderSettings(image_width=24, image_height=16, samples=4, jobs=1, caustics=256)
 GLASS, BLOCK = 6, 7
 """Rows of `busy` in the material table."""
 
@@ -316,11 +316,10 @@ LATER: dict[str, tuple[Callable[[Scene], Scene], set[str]]] = {
     "nothing": (lambda s: s, set()),
     "the same numbers in other arrays": (lambda _s: busy(), set()),
     "camera": (lambda s: replace(s, cameras=s.cameras[::-1]), {"/probes/window"}),
-    # Opaque things do not show what glass is; only the probe that sees it does.
-    "glass": (lambda s: rc.override(s, {"/glass": {"ior": 1.7}}), {"/probes/seeing"}),
-    "what a primvar says of glass": (lambda s: thick(s, "thick"), {"geometry", "/probes/seeing"}),
-    # Other primvars get other numbers in the tables by it, which is nothing that a probe could see.
-    "another primvar for glass": (lambda s: thick(s, "first"), {"geometry", "/probes/seeing"}),
+    # Opaque things show light that has come through glass.
+    "glass": (lambda s: rc.override(s, {"/glass": {"ior": 1.7}}), {"/probes/window", *CUBES}),
+    "what a primvar says of glass": (lambda s: thick(s, "thick"), {"geometry", "/probes/window", *CUBES}),
+    "another primvar for glass": (lambda s: thick(s, "first"), {"geometry", "/probes/window", *CUBES}),
     "light": (
         lambda s: replace(s, lights=(replace(s.lights[0], radiance=(1.0, 1.0, 2.0)),)), {"/probes/window", *CUBES}
     ),

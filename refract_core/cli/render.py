@@ -79,6 +79,14 @@ LightSamples = Annotated[
         help="Rays to a light or to the sky from a pixel's corner that sees a part of it, 1 to 4096. The default is 16."
     ),
 ]
+Caustics = Annotated[
+    str | None,
+    typer.Option(
+        metavar="on|off|INTEGER",
+        help="Photons that carry light through glass, and off it, to other surfaces, 0 to 67108864. off, which draft "
+        "has, lets light go straight through glass, tinted. The default is 65536, at best 262144.",
+    ),
+]
 Tiers = Annotated[
     str | None,
     typer.Option(
@@ -187,6 +195,7 @@ def render(
     samples: Samples = None,
     tolerance: Tolerance = None,
     light_samples: LightSamples = None,
+    caustics: Caustics = None,
     cut: Cut = None,
     tiers: Tiers = None,
     screen: Screen = None,
@@ -216,6 +225,7 @@ def render(
         "samples": samples,
         "tolerance": tolerance,
         "light_samples": light_samples,
+        "caustics": None if caustics is None else _photons(caustics, quality or ""),
         "cut": cut,
         "tiers": None if tiers is None else words(tiers),
         "screen": screen,
@@ -241,6 +251,17 @@ def render(
             skip_existing=skip_existing,
         )
         render_files(order, report, cancel, crew)
+
+
+def _photons(text: str, quality: str) -> int:
+    """`on` is what the quality has, or good where that has none. Raises UsageError."""
+    if text in ("on", "off"):
+        usual = QUALITIES["good"]["caustics"]
+        return max(usual, QUALITIES.get(quality, {}).get("caustics", 0)) if text == "on" else 0
+    try:
+        return int(text)
+    except ValueError:
+        raise UsageError(f"--caustics is '{text}'; it must be on, off, or a number of photons") from None
 
 
 def _purposes(text: str) -> tuple[str, ...]:

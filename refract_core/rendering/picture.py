@@ -166,7 +166,7 @@ def glass_over(
                 ready, seen = Ready(world, bvh, empty_table([], [], camera, False), nobody, 0, ()), scene
             else:
                 seen = _part_of(scene, seen_things(scene, probe))
-                ready = prepare_bare(seen, camera, quiet)
+                ready = prepare_bare(seen, camera, settings, quiet)
             side, rays = texels.shape[1], 0
             for face in range(len(texels)):
                 planes, traced = _draw(ready, seen, face_camera(probe, face), asked, (side, side), quiet)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import UsageError
 from ..kernels.lanes import by_address
+from ..models import BY_TOKEN
 from ..probes.capture import Over, Run, cubemap_of, fill_table
 from ..probes.lookup import ProbeTable, empty_table
 from ..probes.plan import Entry, Plan, plan_capture, plan_picture
@@ -21,6 +22,7 @@ from ..world import environment, textures
 from ..world.embree import Bvh
 from ..world.lights import pack_lights
 from ..world.tables import World, pack_geometry, pack_materials, primvar_slots, world_of
+from .caustics import caustics_of, plan_caustics, with_caustics
 from .session import Session
 from .work import Cancel, Progress, Work, working
 
@@ -61,7 +63,7 @@ def prepare(
     over: Callable[[World, Bvh], Over] | None = None,
     session: Session | None = None,
 ) -> Ready:
-    """Pack tables, build the BVH, capture probes.
+    """Pack tables, build the BVH, send light through glass, capture probes.
 
     Args:
         over: given the packed scene, what draws the glass that probes see (`picture.glass_over`); None leaves it out.
@@ -72,20 +74,22 @@ def prepare(
     # Where pixels are made from corners, most of them are seen four times, however many samples edges take.
     samples = min(max(1, settings.samples // 4) if settings.by_corners else settings.samples, PROBE_SAMPLES)
     if session is None:
-        return _prepare(scene, camera, chosen, is_rough(scene), samples, work, (0.1, 0.2), over)
+        return _prepare(scene, camera, chosen, settings, is_rough(scene), samples, work, (0.1, 0.2), over)
     with session.held(work.cancel):
         return _from_parts(session, scene, camera, chosen, settings, samples, work, (0.1, 0.2), over)
 
 
-def prepare_bare(scene: Scene, camera: Camera, work: Work) -> Ready:
-    """A scene made ready to be drawn without any probes."""
-    return _prepare(scene, camera, plan_capture(scene, []), False, 1, work, (0.0, 0.0))
+def prepare_bare(scene: Scene, camera: Camera, settings: RenderSettings, work: Work) -> Ready:
+    """A scene made ready to be drawn without any probes and caustics."""
+    bare = replace(settings, caustics=0)
+    return _prepare(scene, camera, plan_capture(scene, []), bare, False, 1, work, (0.0, 0.0))
 
 
 def _prepare(
     scene: Scene,
     camera: Camera,
     chosen: Plan,
+    settings: RenderSettings,
     rough: bool,
     samples: int,
     work: Work,
@@ -93,20 +97,26 @@ def _prepare(
     over: Callable[[World, Bvh], Over] | None = None,
 ) -> Ready:
     geometry, bvh, slots = pack_geometry(scene, chosen.captured_sets)
-    world = by_address(
-        world_of(
-            geometry,
-            pack_materials(scene.materials, slots),
-            textures.pack(scene.textures),
-            pack_lights(scene, camera.world_from_camera[:3, 3]),
-            environment.pack(scene.environment),
-        )
+    plain = world_of(
+        geometry,
+        pack_materials(scene.materials, slots),
+        textures.pack(scene.textures),
+        pack_lights(scene, camera.world_from_camera[:3, 3]),
+        environment.pack(scene.environment),
+        _model(settings),
     )
+    thrown = caustics_of(plain, scene, plan_caustics(plain, camera, settings), work)
+    world = by_address(with_caustics(plain, thrown))
     entries = chosen.entries
     table = empty_table([e.probe for e in entries], [e.drawn for e in entries], camera, rough)
     work.progress(span[0], "probes")
     rays = fill_table(table, entries, world, _runner(work, span), samples, over and over(world, bvh))
     return Ready(world, bvh, table, chosen.thing_probe, rays, chosen.notices)
+
+
+def _model(settings: RenderSettings) -> int:
+    """As `GlassShade.model`."""
+    return int(BY_TOKEN[settings.model]) if settings.model else -1
 
 
 def _runner(work: Work, span: tuple[float, float]) -> Run:
@@ -146,22 +156,26 @@ def _from_parts(
     geometry, bvh, slots = hierarchy.made
     materials = pack_materials(scene.materials, slots)
     lights = pack_lights(scene, camera.world_from_camera[:3, 3])
-    world = by_address(world_of(geometry, materials, images.made, lights, sky.made))
+    plain = world_of(geometry, materials, images.made, lights, sky.made, _model(settings))
+    wanted_light = plan_caustics(plain, camera, settings)
+    fallen = hierarchy.number, images.number, sky.number, tuple(lights), scene.materials, settings.model, wanted_light
+    thrown = session.part("caustics", fallen, lambda: caustics_of(plain, scene, wanted_light, work))
+    world = by_address(with_caustics(plain, thrown.made))
 
     rough = is_rough(scene)
     drawn = [entry for entry in chosen.entries if entry.drawn]
-    seen = session.part("seen", _seen(*hierarchy.source), lambda: None, copied=True).number if drawn else None
-    opaque = tuple(material for material in scene.materials if not material.refractive)
-    shown = seen, images.number, sky.number, tuple(lights), opaque, rough, samples
+    # Probes that do not see glass still see what has come through it.
+    lit = hierarchy.number, images.number, sky.number, tuple(lights), scene.materials, settings.model, thrown.number
+    shown = *lit, rough, samples
     # A probe that sees glass is drawn as a picture is, from the scene itself; how the work is cut up never changes it.
-    plain = replace(settings, jobs=0, tile_size=64)
-    glassy = hierarchy.number, plain, scene.materials, scene.bounds, scene.metres_per_unit
+    asked = replace(settings, jobs=0, tile_size=64)
+    glassy = asked, scene.bounds, scene.metres_per_unit
     wanted: dict[Hashable, tuple[Any, Callable[[], _Capture]]] = {}
     for k, entry in enumerate(drawn):
         alone = empty_table([entry.probe], [True], camera, rough)
         by_eye = alone.eye if entry.probe.planar else None
-        width = (span[1] - span[0]) / len(drawn)
-        run = _runner(work, (span[0] + k * width, span[0] + (k + 1) * width))
+        step = (span[1] - span[0]) / len(drawn)
+        run = _runner(work, (span[0] + k * step, span[0] + (k + 1) * step))
 
         def capture(entry: Entry = entry, alone: ProbeTable = alone, run: Run = run) -> _Capture:
             return _Capture(alone, fill_table(alone, [entry], world, run, samples, over and over(world, bvh)))
@@ -196,16 +210,6 @@ def _geometry_source(scene: Scene, chosen: Plan) -> Any:
     """All that `pack_geometry` reads."""
     kinds = tuple((material.refractive, material.cutout) for material in scene.materials)
     return scene.meshes, scene.spheres, kinds, primvar_slots(scene.materials), tuple(chosen.captured_sets)
-
-
-def _seen(meshes: Any, spheres: Any, kinds: Any, _slots: Any, sets: Any) -> Any:
-    """What probes may see of a `_geometry_source`: not what primvars say about glass, such as how thick it is."""
-    glass = np.array([refractive for refractive, _cutout in kinds], bool)
-
-    def seen(thing: Any, materials: Any) -> Any:
-        return replace(thing, primvars={}) if glass[materials].all() else thing
-
-    return [seen(mesh, mesh.materials) for mesh in meshes], [seen(ball, ball.material) for ball in spheres], kinds, sets
 
 
 def _paste(table: ProbeTable, k: int, alone: ProbeTable) -> None:
@@ -248,7 +252,7 @@ def capture_probes(
             raise UsageError(f"{probe.path}: a planar probe's picture depends on the camera; leave it to the render")
     with working(executor, jobs, progress, cancel) as work:
         chosen = plan_capture(scene, [replace(probe, cubemap=None) for probe in probes])
-        ready = _prepare(scene, choose_camera(scene, ""), chosen, True, samples, work, (0.0, 1.0))
+        ready = _prepare(scene, choose_camera(scene, ""), chosen, RenderSettings(), True, samples, work, (0.0, 1.0))
     return [cubemap_of(ready.probes, k) for k in range(len(probes))]
 
 

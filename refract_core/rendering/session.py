@@ -76,23 +76,19 @@ class Session:
         finally:
             self._lock.release()
 
-    def part(self, kind: str, source: Any, make: Callable[[], P], *, copied: bool = False) -> Part[P]:
+    def part(self, kind: str, source: Any, make: Callable[[], P]) -> Part[P]:
         """The one part of a kind: as it is, where it was made from the same, else made and kept.
 
         Args:
             source: all that `make` reads: records, tuples, dictionaries, arrays, texts and numbers.
-            copied: its arrays are those of another part's `source`, which nobody else has.
         """
-        return self.parts(kind, {kind: (source, make)}, copied=copied)[0]
+        return self.parts(kind, {kind: (source, make)})[0]
 
-    def parts(
-        self, kind: str, wanted: Mapping[Hashable, tuple[Any, Callable[[], P]]], *, copied: bool = False
-    ) -> list[Part[P]]:
+    def parts(self, kind: str, wanted: Mapping[Hashable, tuple[Any, Callable[[], P]]]) -> list[Part[P]]:
         """Parts of a kind, as `part`; others of that kind are dropped, unless none is wanted.
 
         Args:
             wanted: by name, under which one is looked for: what it is made from, and what makes it.
-            copied: as in `part`.
 
         Returns:
             In the order of `wanted`.
@@ -105,7 +101,7 @@ class Session:
         del known  # what is dropped is gone before something takes its place
         for name, (source, make) in wanted.items():
             if name not in found:
-                found[name] = Part(next(self._numbers), make(), source if copied else deepcopy(source))
+                found[name] = Part(next(self._numbers), make(), deepcopy(source))
         return [found[name] for name in wanted]
 
 

@@ -1,3 +1,4 @@
-"""Light through glass: a tree of rays for every pixel that sees some, and the tiers that answer where it ends."""
+"""Light through glass: a tree of rays for every pixel that sees some, the tiers that answer where it ends, and photons
+that go the other way."""
 
-__all__ = ["corners", "crossing", "eye", "pixels", "rays", "tiers", "tree"]
+__all__ = ["corners", "crossing", "eye", "photons", "pixels", "rays", "tiers", "tree"]

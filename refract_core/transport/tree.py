@@ -221,7 +221,7 @@ def follow(
         count -= taken
         for lane in range(taken):
             copy_ray(scratch.now, lane, stack, count + lane)
-        _trace(scratch, world, rules, taken)
+        trace(scratch, world, rules, taken)
         _meet_all(scratch, world, view, rules, taken)
         _shine(scratch, world, taken)
         for lane in range(taken):
@@ -237,7 +237,7 @@ def follow(
 
 
 @inlined
-def _trace(scratch: TreeScratch, world: World, rules: Rules, taken: int) -> None:
+def trace(scratch: TreeScratch, world: World, rules: Rules, taken: int) -> None:
     """Find what the packet's rays meet: into `met`, as much of it as matters in a medium."""
     packet, now, met = scratch.packet, scratch.now, scratch.met
     clear(packet)

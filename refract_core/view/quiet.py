@@ -19,13 +19,14 @@ import numpy as np
 
 from ..kernels.arrays import F64_1D, F64_2D, I32_1D, I32_2D
 from ..kernels.compile import inlined, kernel
-from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Scalars, Vectors, new_lanes, put
+from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Vectors, new_lanes, put
 from ..kernels.sampling import Key, set_key
-from ..kernels.vec import Vec, add, along, dot, length, lerp, row, sub
+from ..kernels.vec import Vec, add, dot, length, lerp, mul, row, scale, sub
 from ..world.embree import COHERENT, EVERYTHING, OPAQUE, clear, has_hit
 from ..world.shading import (
     LOBES,
     Block,
+    add_caustics,
     add_light,
     add_light_ray,
     add_sky,
@@ -54,6 +55,8 @@ _CELL = 8
 _LEVELS = 3
 _ALIKE = 0.95
 """Cosine of normals between which light is interpolated."""
+_STEP_OF_LAMP = 0.05
+"""Share of a lamp's light by which neighbours differ that do not see the same of it. Shadows of glass are no steps."""
 _FLAT = 0.1
 """Part of their distance by which places may lie outside of each other's plane."""
 _NET = 1 << 16
@@ -72,16 +75,16 @@ class QuietScratch(NamedTuple):
     """shape (N,): irradiance from the lamps, as the sum of its colours"""
     possible: F64_1D
     """shape (N,): the same if nothing stood before them"""
-    found: F64_1D
-    """shape (N,): what the finder's ray says, 1 or 0; -1 where the light would bring nothing"""
+    found: F64_2D
+    """shape (N, 3): what of the light the finder's ray brings, 0 .. 1; -1 where the light would bring nothing"""
     rays: I32_1D
     """shape (N,): 1 where the share of the sky is known"""
     open: F64_2D
     """shape (N, 3): and that share, colour by colour"""
     cells: I32_2D
     """shape (64, 4): cells yet to be done: first and last column and row"""
-    free: Scalars
-    """1 where nothing is in the way"""
+    free: Vectors
+    """what comes by each ray of a packet, 0 .. 1"""
     weight: Vectors
     """of the rays to the sky"""
 
@@ -91,8 +94,8 @@ class QuietScratch(NamedTuple):
         count = _SPAN * _SPAN
         return QuietScratch(
             new_lanes(ViewScratch), new_lanes(Block, count), np.zeros(count, np.int32), np.zeros(count),
-            np.zeros(count), np.zeros(count), np.zeros(count, np.int32), np.zeros((count, 3)),
-            np.zeros((64, 4), np.int32), np.zeros(LANES), np.zeros((LANES, 3)),
+            np.zeros(count), np.zeros((count, 3)), np.zeros(count, np.int32), np.zeros((count, 3)),
+            np.zeros((64, 4), np.int32), np.zeros((LANES, 3)), np.zeros((LANES, 3)),
         )  # fmt: skip
 
 
@@ -125,6 +128,10 @@ def quiet_tile(
                 if scratch.part[i] >= 0:
                     put(scratch.places.sky_seen, i, row(scratch.open, i))
                     add_sky(scratch.places, i, world.environment)
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            if scratch.part[_place(x - x0, y - y0)] >= 0:
+                add_caustics(scratch.places, _place(x - x0, y - y0), world)
     _send(scratch, world, view, care, layer, x0, y0, x1, y1)
     return packet.tally[0], glass
 
@@ -214,16 +221,17 @@ def _light(
     for y in range(y0, y1):
         for x in range(x0, x1):
             i = _place(x - x0, y - y0)
-            if scratch.part[i] < 0 or found[i] < 0.0:
+            if scratch.part[i] < 0 or found[i, 0] < 0.0:
                 continue
-            places.lamp_seen[i] = found[i]
+            share = row(found, i)
             if shadows and _in_doubt(scratch, i):
-                places.lamp_seen[i] = _share_of_lamp(scratch, world, care.rays, l, i, x, y)
+                share = _share_of_lamp(scratch, world, care.rays, l, i, x, y)
+            put(places.lamp_seen, i, share)
             add_light(places, i, lights, l)
-            radiance = row(lights.radiance, l)
-            possible = (radiance[0] + radiance[1] + radiance[2]) * places.lamp_diffuse[i]
-            scratch.possible[i] += possible
-            scratch.arrives[i] += possible * places.lamp_seen[i]
+            for c in range(3):
+                possible = lights.radiance[l, c] * places.lamp_diffuse[i]
+                scratch.possible[i] += possible
+                scratch.arrives[i] += possible * share[c]
 
 
 @inlined
@@ -242,9 +250,9 @@ def _find(scratch: QuietScratch, world: World, l: int, x0: int, y0: int, x1: int
                 i = _place(x - x0, y - y0)
                 if scratch.part[i] < 0:
                     continue
-                scratch.found[i] = -1.0
+                put(scratch.found, i, (-1.0, -1.0, -1.0))
                 if aim_light(places, i, lights, l):
-                    scratch.found[i] = 1.0
+                    put(scratch.found, i, (1.0, 1.0, 1.0))
                     if shadows:
                         some = True
                         add_light_ray(places, i, lights, l, packet, lane, _net_key(x, y))
@@ -254,7 +262,7 @@ def _find(scratch: QuietScratch, world: World, l: int, x0: int, y0: int, x1: int
             for lane in range(LANES):
                 x, y = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
                 if packet.valid[lane] != 0:
-                    scratch.found[_place(x - x0, y - y0)] = scratch.free[lane]
+                    put(scratch.found, _place(x - x0, y - y0), row(scratch.free, lane))
 
 
 @inlined
@@ -263,23 +271,25 @@ def _in_doubt(scratch: QuietScratch, i: int) -> bool:
     for dy in range(-_MARGIN, _MARGIN + 1):
         for dx in range(-_MARGIN, _MARGIN + 1):
             j = i + dy * _SPAN + dx
-            if scratch.part[j] == scratch.part[i] and scratch.found[j] >= 0.0 and scratch.found[j] != scratch.found[i]:
-                return True
+            if scratch.part[j] == scratch.part[i] and scratch.found[j, 0] >= 0.0:
+                for c in range(3):
+                    if abs(scratch.found[j, c] - scratch.found[i, c]) > _STEP_OF_LAMP:
+                        return True
     return False
 
 
 @inlined
-def _share_of_lamp(scratch: QuietScratch, world: World, rays: int, l: int, i: int, x: int, y: int) -> float:  # noqa: E741
-    """The share of a light that a place sees, by many rays."""
-    packet, total = scratch.looking.packet, 0.0
+def _share_of_lamp(scratch: QuietScratch, world: World, rays: int, l: int, i: int, x: int, y: int) -> Vec:  # noqa: E741
+    """The share of a light that a place gets, by many rays."""
+    packet, total = scratch.looking.packet, (0.0, 0.0, 0.0)
     for first in range(0, rays, LANES):
         clear(packet)
         for lane in range(min(LANES, rays - first)):
             add_light_ray(scratch.places, i, world.lights, l, packet, lane, nth(_net_key(x, y), first + lane, rays))
         visible(packet, world, OPAQUE, scratch.free)
         for lane in range(min(LANES, rays - first)):
-            total += scratch.free[lane]
-    return total / rays
+            total = add(total, row(scratch.free, lane))
+    return scale(total, 1.0 / rays)
 
 
 # --- the sky ------------------------------------------------------------------------------------------------------
@@ -382,7 +392,7 @@ def _node(scratch: QuietScratch, world: World, care: Care, i: int, j: int, x0: i
         visible(packet, world, OPAQUE, scratch.free)
         for lane in range(taken):
             weight = row(scratch.weight, lane)
-            seen, asked = along(seen, weight, scratch.free[lane]), add(asked, weight)
+            seen, asked = add(seen, mul(weight, row(scratch.free, lane))), add(asked, weight)
     scratch.rays[k] = 1
     put(scratch.open, k, share_of_sky(seen, asked, rays))
     return row(scratch.open, k)

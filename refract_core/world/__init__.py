@@ -2,4 +2,7 @@
 that leaves an opaque hit. And what closed meshes enclose.
 """
 
-__all__ = ["embree", "environment", "lights", "offsets", "shading", "solid", "surface", "tables", "textures", "tracing"]
+__all__ = [
+    "caustics", "embree", "environment", "lights", "offsets", "shading", "solid", "surface", "tables", "textures",
+    "tracing",
+]  # fmt: skip

@@ -210,9 +210,11 @@ class Packet(NamedTuple):
     chance: Flags
     """1 where the ray of a lane met a surface that is there by chance, or not (`tracing.intersect_world`)"""
     shadowed: Flags
-    """`valid` as the caller of `tracing.visible` set it, while it looks behind cut-outs"""
+    """`valid` as the caller of `tracing.visible` set it, while it looks behind cut-outs and through glass"""
     ends: Scalars
     """T_FAR of the segments that `tracing.visible` was asked about"""
+    begun: Scalars
+    """where along each the stretch begins that no glass has absorbed along yet"""
 
     @staticmethod
     def fresh() -> Packet:
@@ -233,6 +235,7 @@ class Packet(NamedTuple):
             chance=np.zeros(LANES, np.int32),
             shadowed=np.zeros(LANES, np.int32),
             ends=np.zeros(LANES),
+            begun=np.zeros(LANES),
         )
 
 

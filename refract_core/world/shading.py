@@ -15,10 +15,11 @@ import numpy as np
 from ..kernels.compile import inlined
 from ..kernels.lanes import LANES, Flags, Scalars, Vectors, Words, put
 from ..kernels.sampling import MIRRORED, Key, Keys, Purpose, branched, hash32, key_of, set_key, unit_pair
-from ..kernels.vec import Vec, add, dot, flip_towards, frame, lerp, mul, normalize, row, scale, sub
+from ..kernels.vec import Vec, add, along, dot, flip_towards, frame, lerp, mul, normalize, row, scale, sub
 from ..optics.interface import f0_from_ior
 from ..optics.lobes import MIRROR_ALPHA, sample_half_vector, specular_albedo
 from ..scene import Param
+from .caustics import caustic_irradiance
 from .embree import SCATTERED, Packet, clear, has_hit, ray_direction, set_ray
 from .environment import TEXEL_LUMINANCE, EnvironmentTable, direction_pdf, irradiance, prefiltered, sample_direction
 from .lights import LightTable, highlight, irradiance_factor, shadow_ray
@@ -102,10 +103,10 @@ class Block(NamedTuple):
     """highlight per radiance of the light, without Fresnel, if nothing is in the way"""
     lamp_asked: Flags
     """1 where it would bring anything, and casts shadows"""
-    lamp_seen: Scalars
-    """share of it that nothing stands before, 0 .. 1"""
-    free: Scalars
-    """1 where nothing stands before one point of it, or of the sky"""
+    lamp_seen: Vectors
+    """share of its light that arrives, colour by colour, 0 .. 1"""
+    free: Vectors
+    """the same of one point of it, or of the sky"""
 
     # Within `shade`, for the mirror bounce.
     bounced: Words
@@ -242,10 +243,10 @@ def _gather_lights(block: Block, packet: Packet, world: World, mask: int) -> Non
     for l in range(lights.kind.shape[0]):  # noqa: E741
         for lane in range(LANES):
             block.lamp_asked[lane] = 0
-            block.lamp_seen[lane] = 1.0
+            put(block.lamp_seen, lane, (1.0, 1.0, 1.0))
             if block.on[lane] != 0 and aim_light(block, lane, lights, l) and lights.casts_shadow[l] != 0:
                 block.lamp_asked[lane] = 1
-                block.lamp_seen[lane] = 0.0
+                put(block.lamp_seen, lane, (0.0, 0.0, 0.0))
         most = 0
         for lane in range(LANES):
             if block.lamp_asked[lane] != 0:
@@ -259,7 +260,8 @@ def _gather_lights(block: Block, packet: Packet, world: World, mask: int) -> Non
             visible(packet, world, mask, block.free)
             for lane in range(LANES):
                 if block.lamp_asked[lane] != 0 and k < block.rays[lane]:
-                    block.lamp_seen[lane] += block.free[lane] / block.rays[lane]
+                    share = along(row(block.lamp_seen, lane), row(block.free, lane), 1.0 / block.rays[lane])
+                    put(block.lamp_seen, lane, share)
         for lane in range(LANES):
             if block.on[lane] != 0:
                 add_light(block, lane, lights, l)
@@ -298,10 +300,10 @@ def add_light_ray(
 @inlined
 def add_light(block: Block, lane: int, lights: LightTable, l: int) -> None:  # noqa: E741
     """Add one light, whose share of the hit is known, to its sums."""
-    seen = block.lamp_seen[lane]
-    if seen == 0.0:
+    seen = row(block.lamp_seen, lane)
+    if seen[0] == 0.0 and seen[1] == 0.0 and seen[2] == 0.0:
         return
-    radiance = scale(row(lights.radiance, l), seen)
+    radiance = mul(row(lights.radiance, l), seen)
     n, wo, p = row(block.ns, lane), row(block.wo, lane), row(block.point, lane)
     f = row(block.fresnel, lane)
     coat = block.coat[lane]
@@ -340,7 +342,7 @@ def _gather_sky(block: Block, packet: Packet, world: World, mask: int) -> None:
         for lane in range(LANES):
             if block.on[lane] != 0 and block.matte[lane] != 0 and k < block.rays[lane]:
                 for c in range(3):
-                    block.sky_seen[lane, c] += block.sky_weight[lane, c] * block.free[lane]
+                    block.sky_seen[lane, c] += block.sky_weight[lane, c] * block.free[lane, c]
                     block.sky_asked[lane, c] += block.sky_weight[lane, c]
     for lane in range(LANES):
         if block.on[lane] != 0 and block.matte[lane] != 0:
@@ -463,8 +465,17 @@ def gather(block: Block, packet: Packet, world: World, mask: int) -> None:
     """
     for lane in range(LANES):
         forget_light(block, lane)
+        if block.on[lane] != 0 and block.matte[lane] != 0:
+            add_caustics(block, lane, world)
     _gather_lights(block, packet, world, mask)
     _gather_sky(block, packet, world, mask)
+
+
+@inlined
+def add_caustics(block: Block, lane: int, world: World) -> None:
+    """Add the light that comes through glass, or off it."""
+    e = caustic_irradiance(world.caustics, row(block.point, lane), row(block.ng, lane))
+    put(block.diffuse, lane, add(row(block.diffuse, lane), e))
 
 
 @inlined
@@ -500,7 +511,8 @@ def gloss(block: Block, lane: int, world: World, lamps: float, sky: Vec) -> Vec:
     block.matte[lane] = 0
     for l in range(lights.kind.shape[0]):  # noqa: E741
         if aim_light(block, lane, lights, l):
-            block.lamp_seen[lane] = lamps if lights.casts_shadow[l] != 0 else 1.0
+            share = lamps if lights.casts_shadow[l] != 0 else 1.0
+            put(block.lamp_seen, lane, (share, share, share))
             add_light(block, lane, lights, l)
     put(block.color, lane, row(block.specular, lane))
     put(block.sky_seen, lane, sky)

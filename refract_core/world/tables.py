@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from ..errors import SceneError
 from ..kernels.arrays import F32_1D, F32_2D, F32_3D, I32_1D, I32_2D, I32_3D, I64_1D, I64_2D, U8_1D, U32_2D
-from ..scene import Material, Mesh, Param, Scene, Source, Sphere
+from ..scene import Material, Mesh, Model, Param, Scene, Source, Sphere
 from . import embree
+from .caustics import Caustics, no_caustics
 from .embree import CUTOUT_MOVING, CUTOUT_STATIC, FIRST_CAPTURED_BIT, REFRACTIVE, SOLID_MOVING, SOLID_STATIC, Bvh, Part
 from .environment import EnvironmentTable
 from .lights import LightTable
@@ -87,6 +88,17 @@ class MaterialTable(NamedTuple):
     """1 where what a surface shows depends on where it is seen from"""
 
 
+class GlassShade(NamedTuple):
+    """What glass does to light on its way to a surface."""
+
+    casts: U8_1D
+    """shape (G,): 1 where the light that goes through a part, or off it, is in `World.caustics`; it stops all other"""
+    walked: bool
+    """some glass is looked through straight on; otherwise all of it stops light"""
+    model: int
+    """a `scene.Model` for every refractive material, or -1 for their own"""
+
+
 class World(NamedTuple):
     """The whole scene as a kernel sees it."""
 
@@ -95,6 +107,8 @@ class World(NamedTuple):
     textures: TextureTable
     lights: LightTable
     environment: EnvironmentTable
+    glass: GlassShade
+    caustics: Caustics
     cutouts: bool
     """Some material is a cut-out, so that hits must be looked at."""
     lit: bool
@@ -107,10 +121,18 @@ def world_of(
     textures: TextureTable,
     lights: LightTable,
     environment: EnvironmentTable,
+    model: int,
 ) -> World:
-    """Put the tables together."""
+    """Put the tables together; light goes straight through all glass.
+
+    Args:
+        model: a `scene.Model` for every refractive material, or -1 for their own.
+    """
     lit = len(lights.kind) > 0 or (environment.present and not environment.dark)
-    return World(geometry, materials, textures, lights, environment, bool(materials.cutout.any()), lit)
+    walked = bool((materials.model != Model.NONE).any())
+    glass = GlassShade(np.zeros(len(geometry.thing), np.uint8), walked, model)
+    cutouts = bool(materials.cutout.any())
+    return World(geometry, materials, textures, lights, environment, glass, no_caustics(), cutouts, lit)
 
 
 def pack_materials(materials: Sequence[Material], slots: dict[str, int]) -> MaterialTable:

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from ..kernels.compile import inlined
-from ..kernels.lanes import LANES, Scalars
+from ..kernels.lanes import LANES, Scalars, Vectors, put
 from ..kernels.sampling import chance_of_bits
-from ..kernels.vec import Vec
+from ..kernels.vec import Vec, dot, mul, row, scale
+from ..optics.interface import fresnel_dielectric, transmittance
+from ..optics.models import (
+    BOX_MIN_COS,
+    absorption_distance_of,
+    cosine_inside,
+    is_sheet,
+    on_open_mesh,
+    thickness_of,
+)
 from ..scene import Param
 from .embree import (
     COHERENT,
@@ -15,6 +26,7 @@ from .embree import (
     DIR_Z,
     MASK,
     ORG_X,
+    REFRACTIVE,
     SCATTERED,
     SOLID,
     T_FAR,
@@ -30,11 +42,13 @@ from .embree import (
     set_ray,
 )
 from .offsets import off_surface, past, short_of
-from .surface import Ray, float_input, hit_in, interaction
+from .surface import Ray, color_input, float_input, hit_in, interaction, share_input
 from .tables import World
 
 _MAX_CUTOUTS = 64
 """Holes that one ray may go through; behind so many it meets whatever comes next."""
+_MAX_WALLS = 64
+"""Walls of glass that light is looked at through; behind so many it goes on unchanged."""
 
 
 @inlined
@@ -108,29 +122,102 @@ def add_shadow_ray(packet: Packet, lane: int, point: Vec, ng: Vec, direction: Ve
 
 
 @inlined
-def visible(packet: Packet, world: World, mask: int, seen: Scalars) -> None:
-    """Whether each active lane reaches its T_FAR: 1 or 0 into `seen`, 1 for inactive lanes.
+def visible(packet: Packet, world: World, mask: int, seen: Vectors) -> None:
+    """How much light reaches each active lane from its T_FAR, colour by colour, into `seen`; 1 for inactive lanes.
 
-    Solid things are asked first, all at once; only where they leave the way free must cut-outs be looked at.
-    Glass does not cast shadows: light on its way to an opaque surface is not bent (no caustics).
+    All that may be in the way is asked at once. Only where something is do cut-outs have to be looked at, and glass
+    looked through: straight on, for light on its way to an opaque surface is bent by photons alone (`world.caustics`).
     """
+    handle = world.geometry.handle
     for lane in range(LANES):
         packet.ends[lane] = packet.rays[T_FAR, lane]
-        if packet.valid[lane] != 0:
-            packet.words[MASK, lane] = mask & ~CUTOUT
-    occluded(packet, world.geometry.handle, COHERENT)
-    if not world.cutouts:
-        for lane in range(LANES):
-            seen[lane] = 0.0 if is_blocked(packet, lane) else 1.0
-        return
-    for lane in range(LANES):
         packet.shadowed[lane] = packet.valid[lane]
-        if is_blocked(packet, lane):
-            packet.valid[lane] = 0
-        packet.words[MASK, lane] = mask & CUTOUT
-    intersect_world(packet, world, packet.ends, SCATTERED)
+        put(seen, lane, (1.0, 1.0, 1.0))
+        packet.words[MASK, lane] = mask & ~CUTOUT
+    if not world.glass.walked:
+        for lane in range(LANES):
+            packet.words[MASK, lane] |= REFRACTIVE
+    occluded(packet, handle, COHERENT)
+    _leave_out_blocked(packet, seen)
+    if world.cutouts:
+        for lane in range(LANES):
+            packet.words[MASK, lane] = mask & CUTOUT
+        intersect_world(packet, world, packet.ends, SCATTERED)
+        _leave_out_blocked(packet, seen)
+    if world.glass.walked:
+        _look_through_glass(packet, world, seen)
     for lane in range(LANES):
-        free = packet.valid[lane] != 0 and not has_hit(packet, lane)
-        seen[lane] = 1.0 if packet.shadowed[lane] == 0 or free else 0.0
+        packet.valid[lane] = packet.shadowed[lane]
 
 
+@inlined
+def _leave_out_blocked(packet: Packet, seen: Vectors) -> None:
+    """Lanes with something in the way are dark, and not asked again; the others are as they were."""
+    for lane in range(LANES):
+        if is_blocked(packet, lane) or has_hit(packet, lane):
+            put(seen, lane, (0.0, 0.0, 0.0))
+            packet.valid[lane] = 0
+
+
+@inlined
+def _look_through_glass(packet: Packet, world: World, seen: Vectors) -> None:
+    """Let the glass on each free segment take its part of the light: Fresnel at every interface, as if it were air on
+    the other side, and what the body absorbs along its real length. What throws caustics stops light altogether."""
+    handle, some = world.geometry.handle, False
+    for lane in range(LANES):
+        packet.words[MASK, lane] = REFRACTIVE
+        if packet.valid[lane] != 0:  # from where it began: behind a hole of a cut-out it is further on
+            restart(packet, lane, 0.0, packet.ends[lane])
+    occluded(packet, handle, COHERENT)
+    for lane in range(LANES):
+        packet.begun[lane] = 0.0
+        packet.valid[lane] = packet.valid[lane] if is_blocked(packet, lane) else 0
+        if packet.valid[lane] != 0:
+            restart(packet, lane, 0.0, packet.ends[lane])
+            some = True
+    if not some:
+        return
+    for _ in range(_MAX_WALLS):
+        intersect_world(packet, world, packet.ends, COHERENT)
+        again = False
+        for lane in range(LANES):
+            found = has_hit(packet, lane)
+            packet.valid[lane] = 0
+            if found and _pass_wall(packet, lane, world, seen):
+                restart(packet, lane, past(hit_distance(packet, lane)), packet.ends[lane])
+                again = True
+        if not again:
+            break
+
+
+@inlined
+def _pass_wall(packet: Packet, lane: int, world: World, seen: Vectors) -> bool:
+    """Take from `seen` what the wall of glass that was hit takes. Whether any light is left."""
+    hit, ray, glass = hit_in(packet, lane, world.geometry), ray_of(packet, lane), world.glass
+    if glass.casts[hit.part] != 0:
+        put(seen, lane, (0.0, 0.0, 0.0))
+        return False
+    at = interaction(world.geometry, hit, ray, 0.0)
+    model = world.materials.model[hit.material] if glass.model < 0 else glass.model
+    if world.geometry.sheet[hit.part] != 0:
+        model = on_open_mesh(model)
+    ior, cosine = max(1.0, float_input(world, at, Param.IOR.value)), abs(dot(at.ng, ray.direction))
+    share = 1.0 - fresnel_dielectric(cosine, 1.0 / ior)
+    length = 0.0
+    enters = dot(at.ng, ray.direction) < 0.0
+    if is_sheet(model):
+        length = thickness_of(model, 0.0) / max(cosine_inside(cosine, ior), BOX_MIN_COS)
+    elif enters:
+        packet.begun[lane] = hit.t
+    else:
+        length = hit.t - packet.begun[lane]
+        packet.begun[lane] = hit.t
+    if is_sheet(model) or enters:
+        share *= 1.0 - share_input(world, at, Param.OPACITY.value)
+    left = row(seen, lane)
+    if length > 0.0:
+        distance: float = np.float64(world.materials.absorption_distance[hit.material])
+        color = color_input(world, at, Param.TRANSMITTANCE.value)
+        left = mul(left, transmittance(color, absorption_distance_of(model, distance), length))
+    put(seen, lane, scale(left, share))
+    return share > 0.0

@@ -58,7 +58,7 @@ class Oracle:
         self.right, self.up, back, self.eye = (vec(m[:3, c]) for c in range(4))
         self.forward = scaled(back, -1.0)
         self.window = _conformed(self.camera.window, width, height)
-        self.shader = Shader(scene, self.eye)
+        self.shader = Shader(scene, self.eye, settings.model)
         across = (self.window[1] - self.window[0]) / width
         self.jitters = sampling.jitters(settings.samples)
         self.spread = 0.0 if self.camera.orthographic else across / math.sqrt(settings.samples)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from refract_core.scene import Param, Scene
+from refract_core.scene import Model, Param, Scene
 
-from . import lights, sampling
+from . import lights, optics, sampling
 from .sampling import Key
 from .sky import Sky, sky_of
-from .surface import Surface, number, specular_albedo, surface_at
+from .surface import Surface, color, number, specular_albedo, surface_at
 from .vec import ZERO, Vec, add, basis, clamp, cross, dot, mul, scaled, sub, unit, vec
-from .world import NEAR, OPAQUE, Hit, World, first
+from .world import GLASS, NEAR, OPAQUE, Hit, World, all_present, first
 
 _MIRROR_ALPHA = 1e-3
 _COAT_F0 = (0.04, 0.04, 0.04)
@@ -40,8 +40,10 @@ class Gathered(NamedTuple):
 class Shader:
     """A scene with all that lights it."""
 
-    def __init__(self, scene: Scene, eye: Vec) -> None:
+    def __init__(self, scene: Scene, eye: Vec, override: str = "") -> None:
+        """`override`: model of all glass, or none."""
         self.scene = scene
+        self.override = override
         self.world = World(scene)
         self.sky = sky_of(scene.environment) if scene.environment is not None else None
         self.lamps = lights.lamps_of(scene, eye)
@@ -69,8 +71,34 @@ class Shader:
             bits = ray_bits(o, d)
         return opacity > sampling.hashed(bits[0], bits[1], bits[2] ^ hit.face.part) / 2**32
 
-    def _free(self, surface: Surface, d: Vec, distance: float) -> bool:
-        return self.nearest(surface.point, d, OPAQUE, distance * (1.0 - 1e-4)) is None
+    def _arrives(self, surface: Surface, d: Vec, distance: float) -> Vec:
+        """Share of a light's point, straight through all glass on the way: what each wall lets pass, with air on its
+        other side, and what bodies absorb between one wall and the next."""
+        o, far = surface.point, distance * (1.0 - 1e-4)
+        if self.nearest(o, d, OPAQUE, far) is not None:
+            return ZERO
+        share, begun = (1.0, 1.0, 1.0), 0.0
+        for hit in all_present(self.world.candidates(o, d, NEAR, far, GLASS), lambda h: self.present(h, o, d, None)):
+            m = self.world.material(hit)
+            model = Model[self.override.upper()] if self.override else m.model
+            sheet = model is Model.THIN or (model is Model.TRACED and hit.face.sheet)
+            ior, cosine = max(1.0, number(self.scene, hit, m, Param.IOR)), abs(dot(hit.ng, d))
+            inwards = dot(hit.ng, d) < 0.0
+            clear = 1.0 - optics.fresnel(cosine, 1.0 / ior)
+            if sheet or inwards:
+                clear *= 1.0 - clamp(number(self.scene, hit, m, Param.OPACITY))
+            length = 0.0
+            if sheet:
+                length = optics.THIN / math.sqrt(1.0 - (1.0 - cosine * cosine) / (ior * ior))
+            elif not inwards:
+                length = hit.t - begun
+            if not sheet:
+                begun = hit.t
+            tint = color(self.scene, hit, m, Param.TRANSMITTANCE)
+            over = optics.THIN if sheet else m.absorption_distance
+            left = optics.absorbed(tint, over, length) if length > 0.0 else (1.0, 1.0, 1.0)
+            share = scaled(mul(share, left), clear)
+        return share
 
     # --- Light ---
 
@@ -88,16 +116,17 @@ class Shader:
             if lamp.kind is not None:
                 u1, u2 = sampling.pair(key, sample, sampling.FIRST_LIGHT + k)
                 d, distance = lights.shadow_target(lamp, s.point, u1, u2)
-                if not self._free(s, d, distance):
-                    continue
-            irradiance = add(irradiance, scaled(lamp.radiance, even))
-            highlights = add(highlights, mul(lamp.radiance, vec([gloss * f + over for f in fresnel])))
+                share = self._arrives(s, d, distance)
+            else:
+                share = (1.0, 1.0, 1.0)
+            radiance = mul(lamp.radiance, share)
+            irradiance = add(irradiance, scaled(radiance, even))
+            highlights = add(highlights, mul(radiance, vec([gloss * f + over for f in fresnel])))
         seen = ZERO
         if self.sky is not None:
             d, share = self._sky_direction(self.sky, s.ns, key, sample)
-            if self._free(s, d, math.inf):
-                seen = scaled(share, s.occlusion)
-                irradiance = add(irradiance, mul(self.sky.irradiance(s.ns), seen))
+            seen = scaled(mul(share, self._arrives(s, d, math.inf)), s.occlusion)
+            irradiance = add(irradiance, mul(self.sky.irradiance(s.ns), seen))
         return Gathered(irradiance, highlights, seen)
 
     def _sky_direction(self, sky: Sky, n: Vec, key: Key, sample: int) -> tuple[Vec, Vec]:

@@ -1,0 +1,308 @@
+"""Caustics made ready: which glass throws them, how many photons, how fine they are kept."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..kernels.lanes import by_address, scratch
+from ..models import Behind, Model
+from ..scene import F64, Camera, LightKind, Scene
+from ..settings import RenderSettings
+from ..transport.crossing import Rules
+from ..transport.photons import BANDS, SECTORS, Landings, PhotonScratch, Sources, photon_batch, weigh_sources
+from ..transport.rays import ALL_CHANNELS, Rays, new_rays
+from ..transport.tree import TreeScratch
+from ..view.camera import image_size
+from ..world.caustics import LEVELS, Caustics, add_photons, count_photons, new_caustics, no_caustics, raise_levels
+from ..world.solid import winding
+from ..world.tables import GlassShade, World
+from .work import Work
+
+_CUT = 0.01
+"""Weight below which a photon's branch is given to its sibling: a tenth gains nothing, and costs a third more."""
+_LAYERS = 32
+_BATCH = 1024
+"""Photons that a thread follows at once."""
+_WANTED = 4.0
+"""Photons in a texel, about: fewer are noise, more could be drawn finer."""
+_PIXELS = 1.2
+"""Sides of a pixel that the smallest texel has, at least."""
+_COARSE = 8.0
+"""Sides of a pixel that the largest has, about: what light falls on has edges and curves."""
+_PLATE = 0.9
+"""Part of a body's surface that looks one way or the opposite, from which on it is a plate, which
+light leaves as it came."""
+_MOST_SOURCES = 1 << 20
+_BENDING = [int(model) for model in Model if model.behind in (Behind.MESH, Behind.BALL)]
+
+
+class Thrown(NamedTuple):
+    """Light through glass, made ready."""
+
+    glass: GlassShade
+    table: Caustics
+
+
+def throws_caustics(world: World) -> NDArray[np.bool_]:
+    """Which parts are bodies of glass that bend light: closed, and no plates, nor slabs by their model. Shape (G,)."""
+    geometry, materials, glass = world.geometry, world.materials, world.glass
+    casts = np.zeros(len(geometry.thing), np.bool_)
+    for g in range(len(casts)):
+        used = np.unique(geometry.material[_rows(world, g)])
+        own = materials.model[used]
+        refractive = own.size > 0 and bool((own != 0).all()) and not materials.cutout[used].any()
+        models = own if glass.model < 0 else np.array([glass.model])
+        if refractive and not geometry.sheet[g] and bool(np.isin(models, _BENDING).all()):
+            casts[g] = geometry.sphere[g, 3] > 0.0 or not _is_plate(world, g)
+    return casts
+
+
+def _rows(world: World, part: int) -> slice:
+    """A part's primitives, as rows of `Geometry.triangles`."""
+    first = world.geometry.first
+    last = first[part + 1] if part + 1 < len(first) else len(world.geometry.triangles)
+    return slice(int(first[part]), int(last))
+
+
+def _corners(world: World, part: int) -> F64:
+    """Shape (T, 3, 3) [m]."""
+    corners: F64 = world.geometry.points[world.geometry.triangles[_rows(world, part)]].astype(np.float64)
+    return corners
+
+
+def _is_plate(world: World, part: int) -> bool:
+    corners = _corners(world, part)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(across, axis=1)
+    if not area.any():
+        return True
+    facing = across[area.argmax()] / area.max()
+    same_way = np.abs(across @ facing) > 0.999 * area
+    return bool(area[same_way].sum() > _PLATE * area.sum())
+
+
+# --- sources ------------------------------------------------------------------------------------------------------
+
+
+def _sources(world: World, scene: Scene, casts: NDArray[np.bool_]) -> Sources:
+    """Every piece of glass before every light; of very many, an even choice by area stands for all."""
+    shadowing = _shadowing(world)
+    parts, primitives, areas = _pieces(world, casts)
+    most = max(1, _MOST_SOURCES // max(1, len(shadowing)))
+    if len(areas) > most:
+        edges = np.cumsum(areas) / areas.sum()
+        kept = np.searchsorted(edges, (np.arange(most) + 0.5) / most)
+        parts, primitives, areas = parts[kept], primitives[kept], np.full(most, areas.sum() / most)
+    rows: list[list[Any]] = []
+    for light in shadowing:
+        within = _bodies_around(world, scene, light, np.flatnonzero(casts))
+        for side, these in ((1.0, np.arange(len(parts))), (-1.0, np.flatnonzero(np.isin(parts, within)))):
+            same = np.ones(len(these))
+            rows.append([same * light, parts[these], primitives[these], same * side, areas[these]])
+    columns: list[Any] = [np.concatenate(column) for column in zip(*rows, strict=True)]
+    light_of, part, primitive = (column.astype(np.int32) for column in columns[:3])
+    return Sources(light_of, part, primitive, columns[3], columns[4], np.zeros(len(part)))
+
+
+def _shadowing(world: World) -> list[int]:
+    """Lights that things stand before, by their rows; one more than the last is the sky."""
+    count = len(world.lights.kind)
+    found = [light for light in range(count) if world.lights.casts_shadow[light]]
+    return [*found, count] if world.environment.present and not world.environment.dark else found
+
+
+def _pieces(world: World, casts: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64], F64]:
+    """Part, primitive and area [m^2] of all triangles of glass, neighbours together, and of spheres' patches."""
+    found: list[tuple[Any, Any, Any]] = []
+    for g in np.flatnonzero(casts):
+        radius = float(world.geometry.sphere[g, 3])
+        if radius > 0.0:
+            count = BANDS * SECTORS
+            order, area = np.arange(count), np.full(count, 4.0 * math.pi * radius * radius / count)
+        else:
+            corners = _corners(world, int(g))
+            order = _along_a_curve(corners.mean(axis=1))
+            across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            area = 0.5 * np.linalg.norm(across, axis=1)[order]
+        found.append((np.full(len(order), g), order, area))
+    parts, primitives, areas = (np.concatenate(column) for column in zip(*found, strict=True))
+    return parts, primitives, areas
+
+
+def _along_a_curve(points: F64) -> NDArray[np.int64]:
+    """Order of points along Morton's curve: those next to each other are so in space, so that strata are, too."""
+    low, size = points.min(axis=0), max(float(np.ptp(points, axis=0).max()), 1e-30)
+    cells = ((points - low) / size * 1023.0).astype(np.int64)
+    code = np.zeros(len(points), np.int64)
+    for bit in range(10):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return np.argsort(code, kind="stable")
+
+
+def _bodies_around(world: World, scene: Scene, light: int, parts: NDArray[np.int64]) -> list[int]:
+    """The bodies that a light stands in: its rays come to them from inside."""
+    lamps = world.lights
+    if light == len(lamps.kind) or lamps.kind[light] == LightKind.DISTANT:
+        return []
+    at = lamps.axes[light, 3]
+    found = []
+    for g in parts:
+        thing = int(world.geometry.thing[g])
+        if world.geometry.sphere[g, 3] > 0.0:
+            if math.dist(at, world.geometry.sphere[g, :3]) < world.geometry.sphere[g, 3]:
+                found.append(int(g))
+            continue
+        mesh = scene.meshes[thing]
+        near = ((mesh.points.min(axis=0) < at) & (at < mesh.points.max(axis=0))).all()
+        if near and winding(at, mesh.points.astype(np.float64), mesh.triangles) > 0.5:
+            found.append(int(g))
+    return found
+
+
+# --- how fine -----------------------------------------------------------------------------------------------------
+
+
+def _bounds(world: World, part: int) -> tuple[F64, float]:
+    """Middle and radius of a part's box [m]."""
+    ball = world.geometry.sphere[part]
+    if ball[3] > 0.0:
+        return ball[:3].astype(np.float64), float(ball[3])
+    corners = _corners(world, part).reshape(-1, 3)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    return (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+
+
+def _texels(world: World, casts: NDArray[np.bool_], camera: Camera, width: int) -> tuple[F64, NDArray[np.int32]]:
+    """`Wanted.texel` and `finest`: powers of two, so that a camera that moves a little changes nothing."""
+    finest, largest = np.zeros(len(casts), np.int32), 0.0
+    wanted = np.full(len(casts), math.inf)
+    left, right = camera.window[0], camera.window[1]
+    for g in np.flatnonzero(casts):
+        middle, radius = _bounds(world, int(g))
+        away = 1.0 if camera.orthographic else max(math.dist(camera.world_from_camera[:3, 3], middle), radius / 2)
+        pixel = away * (right - left) / width
+        wanted[g] = _PIXELS * pixel
+        largest = max(largest, min(radius / 4, _COARSE * pixel))
+    top = 2.0 ** math.ceil(math.log2(largest))
+    finest[casts] = np.clip(np.ceil(np.log2(top / wanted[casts])), 0, LEVELS - 1)
+    texel: F64 = top * np.power(0.5, np.arange(int(finest.max()) + 1))
+    return texel, finest
+
+
+# --- the table ----------------------------------------------------------------------------------------------------
+
+
+class Wanted(NamedTuple):
+    """What caustics are made of: the same as long as the camera moves a little."""
+
+    casts: NDArray[np.bool_]
+    """shape (G,): parts that throw them"""
+    texel: F64
+    """sizes of texels [m], the largest first"""
+    finest: NDArray[np.int32]
+    """shape (G,): smallest level that is of use, by the glass that a photon came by first"""
+    photons: int
+
+
+def plan_caustics(world: World, camera: Camera, settings: RenderSettings) -> Wanted | None:
+    """What is wanted, or None: no photons, no such glass, no light, nothing for it to fall on.
+
+    Args:
+        world: not by address.
+    """
+    if settings.caustics == 0 or not _shadowing(world):
+        return None
+    casts = throws_caustics(world)
+    if not casts.any() or (world.materials.model[world.geometry.material] != 0).all():
+        return None
+    width, _ = image_size(camera, settings.image_width, settings.image_height)
+    return Wanted(casts, *_texels(world, casts, camera, width), settings.caustics)
+
+
+def caustics_of(world: World, scene: Scene, wanted: Wanted | None, work: Work) -> Thrown | None:
+    """Send the photons."""
+    if wanted is None:
+        return None
+    walked = bool(_glass_parts(world)[~wanted.casts].any())
+    glass = GlassShade(wanted.casts.astype(np.uint8), walked, world.glass.model)
+    return Thrown(glass, _table(world._replace(glass=glass), scene, wanted, work))
+
+
+def with_caustics(world: World, thrown: Thrown | None) -> World:
+    """The world with the light that its glass throws."""
+    return world if thrown is None else world._replace(glass=thrown.glass, caustics=thrown.table)
+
+
+def _glass_parts(world: World) -> NDArray[np.bool_]:
+    refractive = world.materials.model[world.geometry.material] != 0
+    return np.array([refractive[_rows(world, g)].any() for g in range(len(world.geometry.thing))], np.bool_)
+
+
+def _table(world: World, scene: Scene, wanted: Wanted, work: Work) -> Caustics:
+    seen, sources, photons = by_address(world), _sources(world, scene, wanted.casts), wanted.photons
+    held = by_address(sources)
+    rows = range(0, len(sources.area), 1 << 13)
+    work.run(lambda first: weigh_sources(seen, held, first, min(first + (1 << 13), len(sources.area))), rows)
+    flux = sources.flux
+    if not flux.any():
+        return no_caustics()
+    # A piece that seems dark may get some light between the four places that were looked at.
+    flux += 1e-3 * flux.sum() * sources.area / sources.area.sum()
+    cdf = np.concatenate([[0.0], np.cumsum(flux) / flux.sum()])
+    cdf[-1] = 1.0
+    rules = by_address(Rules(world.glass.model, _LAYERS, _CUT, True))
+    in_air = by_address(_ray_in_air())
+
+    def follow(first: int) -> Landings:
+        room = 8 * _BATCH
+        while True:
+            words = np.zeros(room, np.int32), np.zeros(room, np.int32)
+            landings = Landings(np.zeros((room, 3)), np.zeros((room, 3)), np.zeros((room, 3)), *words)
+            last = min(first + _BATCH, photons)
+            landed = photon_batch(
+                seen, held, cdf, rules, in_air, scratch(TreeScratch), scratch(PhotonScratch), first, last, photons,
+                by_address(landings),
+            )  # fmt: skip
+            if landed <= room:
+                columns: Any = (column[:landed] for column in landings)
+                return Landings(*columns)
+            room = landed
+
+    all_landings = work.run(follow, range(0, photons, _BATCH))
+    columns: Any = (np.concatenate(column) for column in zip(*all_landings, strict=True))
+    landings = Landings(*columns)
+    return _written(landings, wanted) if len(landings.part) else no_caustics()
+
+
+def _ray_in_air() -> Rays:
+    ray = new_rays(1)
+    ray.weight[:] = ray.clear[:] = 1.0
+    ray.end[:] = math.inf
+    ray.channel[:], ray.thing[:] = ALL_CHANNELS, -1
+    return ray
+
+
+def _written(landings: Landings, wanted: Wanted) -> Caustics:
+    """Landings in a table that is large enough."""
+    texel, finest = wanted.texel, wanted.finest
+    count = len(landings.part)
+    slots = 1 << max(10, math.ceil(math.log2(count)))
+    levels, limits, level, left = np.zeros(count, np.int32), finest[landings.part], 0, count
+    while left > 0:
+        table = by_address(new_caustics(slots, texel, 6))
+        if not count_photons(table, landings.point, landings.normal, landings.flux, landings.kind, levels, level):
+            slots *= 2
+            continue
+        places = landings.point, landings.normal, landings.kind
+        left = raise_levels(table, *places, limits, _WANTED, levels, level)
+        level += 1
+    while True:
+        table = new_caustics(slots, texel)
+        if add_photons(by_address(table), landings.point, landings.normal, landings.flux, levels) == count:
+            return table
+        slots *= 2

@@ -1,0 +1,304 @@
+"""Light that glass has bent or mirrored onto opaque surfaces: irradiance in sparse texels of the world.
+
+Photons (`transport.photons`) end on opaque surfaces. Each leaves its flux in texels of a grid that is looked at along
+an axis of the world, the one that the surface faces most; so a texel is a square on that side of things, and a surface
+in space has texels without being unwrapped. They are kept in a hash table: key (level, axis and sign, layer, column,
+row). What arrives at a place is the flux around it over the area of the texels on the surface.
+
+A photon's flux is spread over as many texels as there are few photons around it: where light is focused the texels are
+fine, and elsewhere they are large and quiet (a sample-point estimator: Silverman, "Density Estimation", 1986, 5.3).
+Every photon is counted once and with all of its flux, so energy is kept whatever the sizes.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ..kernels.arrays import F32_2D, F64_1D, F64_2D, I32_1D, I64_1D
+from ..kernels.compile import inlined, kernel
+from ..kernels.vec import Vec, along, dot, length, row
+from ..scene import F32
+from .environment import TEXEL_LUMINANCE
+
+LEVELS = 12
+"""Sizes of texels, each half of the one before."""
+_MARK = 15
+"""Level of the keys of marks."""
+_AXIS_SHARE = 0.4
+"""Cosine to an axis from which on a photon is written for those who look along it, and a place looks along it; of three
+one always has .57."""
+_EMPTY = -1
+_COLUMNS = 19
+"""Bits of a column's or row's number, of which 21 bits are left to a layer, a side and a level."""
+_LAYERS = 16
+_FLAT = 0.99
+"""Length of the mean of unit normals below which a texel is too large for what it lies on: it bends, or has an edge."""
+_FILTER = np.array([0.25, 0.5, 0.25])
+
+
+class Caustics(NamedTuple):
+    """A hash table of texels, of H slots, a power of two."""
+
+    keys: I64_1D
+    """shape (H,); -1 where a slot is free"""
+    flux: F32_2D
+    """shape (H, 3) [radiance * sr * m^2]"""
+    marks: I32_1D
+    """shape (H,): of a largest texel, the levels that a place in it has to look at, a bit for each"""
+    texel: F64_1D
+    """shape (K,): their sizes [m], the largest first; none where there are no caustics"""
+    low: F64_1D
+    """shape (3,): bounds of all texels [m]"""
+    high: F64_1D
+
+
+def no_caustics() -> Caustics:
+    """A table without any light."""
+    return new_caustics(1, np.zeros(0))
+
+
+def new_caustics(slots: int, texel: F64_1D, columns: int = 3) -> Caustics:
+    """An empty table. `slots`: a power of two; `columns`: 6 for `count_photons`."""
+    flux: F32 = np.zeros((slots, columns), np.float32)
+    keys, marks = np.full(slots, _EMPTY, np.int64), np.zeros(slots, np.int32)
+    return Caustics(keys, flux, marks, texel, np.full(3, math.inf), np.full(3, -math.inf))
+
+
+# --- addresses ----------------------------------------------------------------------------------------------------
+
+
+@inlined
+def _coordinates(p: Vec, axis: int, texel: float) -> tuple[float, float, float]:
+    """Column, row and layer of a place as it is seen along an axis, not rounded; a layer is two texels thick."""
+    u = p[1] if axis == 0 else p[0]
+    v = p[1] if axis == 2 else p[2]
+    return u / texel, v / texel, p[axis] / (2.0 * texel)
+
+
+@inlined
+def _key(level: int, side: int, column: int, line: int, layer: int) -> int:
+    """`side`: an axis and a sign, 0 .. 5, and perhaps a kind of photon, above. Numbers run around after some 500,000
+    texels."""
+    most, layers = (1 << _COLUMNS) - 1, (1 << _LAYERS) - 1
+    head = np.int64(level) * 16 + side
+    return int(((head << _LAYERS | (layer & layers)) << _COLUMNS | (column & most)) << _COLUMNS | (line & most))
+
+
+@inlined
+def _slot(keys: I64_1D, key: int) -> int:
+    """Where a key is, or the free slot where it belongs (linear probing)."""
+    last = keys.shape[0] - 1
+    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    i = np.int64(mixed >> np.uint64(24)) & last
+    while keys[i] != _EMPTY and keys[i] != key:
+        i = (i + 1) & last
+    return int(i)
+
+
+@inlined
+def _main_axis(n: Vec) -> int:
+    x, y, z = abs(n[0]), abs(n[1]), abs(n[2])
+    return 0 if x >= y and x >= z else (1 if y >= z else 2)
+
+
+@inlined
+def _side_of(n: Vec, axis: int) -> int:
+    return 2 * axis + (1 if n[axis] > 0.0 else 0)
+
+
+# --- writing ------------------------------------------------------------------------------------------------------
+
+
+@kernel
+def count_photons(
+    table: Caustics, points: F64_2D, normals: F64_2D, flux: F64_2D, kinds: I32_1D, levels: I32_1D, level: int
+) -> bool:
+    """Sum up the photons that have come to a level in its texels, kind by kind: in the place of flux their luminance,
+    its square, their number, and their normals. False if the table is half full; then it is of no use."""
+    filled = 0
+    for k in range(points.shape[0]):
+        if levels[k] != level:
+            continue
+        n = row(normals, k)
+        axis = _main_axis(n)
+        u, v, w = _coordinates(row(points, k), axis, table.texel[level])
+        key = _key(level, _side_of(n, axis) + 8 * kinds[k], math.floor(u), math.floor(v), math.floor(w))
+        slot = _slot(table.keys, key)
+        if table.keys[slot] == _EMPTY:
+            filled += 1
+            if 2 * filled > table.keys.shape[0]:
+                return False
+            table.keys[slot] = key
+        light = dot(row(flux, k), TEXEL_LUMINANCE)
+        table.flux[slot, 0] += light
+        table.flux[slot, 1] += light * light
+        table.flux[slot, 2] += 1.0
+        for c in range(3):
+            table.flux[slot, 3 + c] += n[c]
+    return True
+
+
+@kernel
+def raise_levels(
+    table: Caustics, points: F64_2D, normals: F64_2D, kinds: I32_1D, finest: I32_1D, wanted: float, levels: I32_1D,
+    level: int,
+) -> int:  # fmt: skip
+    """Let photons of a level go on to the next, whose texels are a quarter as large, where these have `wanted` of them:
+    as many of equal flux as would be as even (Kish, "Survey Sampling", 1965: the effective size of a sample). On
+    what bends inside of a texel a quarter is enough: noise is better than light that has gone astray.
+
+    Args:
+        table: of `count_photons`.
+        kinds: shape (N,): 0 or 1; those of another kind are not counted.
+        finest: shape (N,): levels that they may not go beyond.
+        levels: shape (N,): where they have come to.
+
+    Returns:
+        How many went on.
+    """
+    went = 0
+    for k in range(points.shape[0]):
+        if levels[k] != level or finest[k] <= level:
+            continue
+        n = row(normals, k)
+        axis = _main_axis(n)
+        u, v, w = _coordinates(row(points, k), axis, table.texel[level])
+        column, line, layer = math.floor(u), math.floor(v), math.floor(w)
+        light = squares = number = 0.0
+        mean = (0.0, 0.0, 0.0)
+        for i in range(-1, 2):
+            for j in range(-1, 2):
+                key = _key(level, _side_of(n, axis) + 8 * kinds[k], column + i, line + j, layer)
+                slot = _slot(table.keys, key)
+                share = _FILTER[i + 1] * _FILTER[j + 1]
+                light += share * table.flux[slot, 0]
+                squares += share * table.flux[slot, 1]
+                number += share * table.flux[slot, 2]
+                mean = along(mean, (table.flux[slot, 3], table.flux[slot, 4], table.flux[slot, 5]), share)
+        bent = length(mean) < _FLAT * number
+        if light * light >= (wanted if bent else 4.0 * wanted) * squares:
+            levels[k] = level + 1
+            went += 1
+    return went
+
+
+@kernel
+def add_photons(
+    table: Caustics, points: F64_2D, normals: F64_2D, flux: F64_2D, levels: I32_1D
+) -> int:
+    """Write photons into a table. Returns how many were written: fewer than there are if it is half full, and then it
+    is of no use."""
+    filled = 0
+    for k in range(points.shape[0]):
+        n, p = row(normals, k), row(points, k)
+        texel = table.texel[levels[k]]
+        for axis in range(3):
+            table.low[axis] = min(table.low[axis], p[axis] - 3.0 * texel)
+            table.high[axis] = max(table.high[axis], p[axis] + 3.0 * texel)
+            if abs(n[axis]) < _AXIS_SHARE:
+                continue
+            u, v, w = _coordinates(p, axis, texel)
+            column, line = math.floor(u - 0.5), math.floor(v - 0.5)
+            s, t = u - 0.5 - column, v - 0.5 - line
+            for corner in range(4):
+                i, j = corner % 2, corner // 2
+                share = (s if i else 1.0 - s) * (t if j else 1.0 - t)
+                key = _key(levels[k], _side_of(n, axis), column + i, line + j, math.floor(w))
+                slot = _slot(table.keys, key)
+                if table.keys[slot] == _EMPTY:
+                    filled += 1
+                    if 2 * filled > table.keys.shape[0]:
+                        return k
+                    table.keys[slot] = key
+                    filled += _mark(table, column + i, line + j, w, _side_of(n, axis), levels[k])
+                for c in range(3):
+                    table.flux[slot, c] += share * flux[k, c]
+    return points.shape[0]
+
+
+@inlined
+def _mark(table: Caustics, column: int, line: int, w: float, side: int, level: int) -> int:
+    """Note in the largest texels that whoever looks at a place near this new texel has to look at its level. Returns
+    how many are new."""
+    share = table.texel[level] / table.texel[0]
+    u, v, w = (column + 0.5) * share, (line + 0.5) * share, (math.floor(w) + 0.5) * share
+    reach = 2.0 * share  # of the filter
+    new = 0
+    for i in range(math.floor(u - reach), math.floor(u + reach) + 1):
+        for j in range(math.floor(v - reach), math.floor(v + reach) + 1):
+            for k in range(math.floor(w - 1.5 * share), math.floor(w + 1.5 * share) + 1):
+                slot = _slot(table.keys, _key(_MARK, side, i, j, k))
+                if table.keys[slot] == _EMPTY:
+                    new += 1
+                    table.keys[slot] = _key(_MARK, side, i, j, k)
+                table.marks[slot] |= 1 << level
+    return new
+
+
+# --- reading ------------------------------------------------------------------------------------------------------
+
+
+@inlined
+def caustic_irradiance(table: Caustics, p: Vec, n: Vec) -> Vec:
+    """Irradiance [radiance * sr] that photons brought to a surface.
+
+    Args:
+        p: place on it [m].
+        n: its unit geometric normal, on the side that is seen.
+    """
+    light = (0.0, 0.0, 0.0)
+    if table.texel.shape[0] == 0 or not _within(table, p):
+        return light
+    total = 0.0
+    for axis in range(3):
+        total += max(0.0, n[axis] * n[axis] - _AXIS_SHARE * _AXIS_SHARE)
+    for axis in range(3):
+        share = max(0.0, n[axis] * n[axis] - _AXIS_SHARE * _AXIS_SHARE)
+        if share > 0.0:  # seen along several axes it has no seam where one of them takes over
+            light = along(light, _seen_along(table, p, n, axis), share / total)
+    return light
+
+
+@inlined
+def _seen_along(table: Caustics, p: Vec, n: Vec, axis: int) -> Vec:
+    """What the texels say that are looked at along an axis."""
+    r = g = b = 0.0
+    side = _side_of(n, axis)
+    u, v, w = _coordinates(p, axis, table.texel[0])
+    mark = _slot(table.keys, _key(_MARK, side, math.floor(u), math.floor(v), math.floor(w)))
+    for level in range(table.texel.shape[0]):
+        if (table.marks[mark] >> level) & 1 == 0:
+            continue
+        texel = table.texel[level]
+        u, v, w = _coordinates(p, axis, texel)
+        column, line, layer = math.floor(u - 0.5), math.floor(v - 0.5), math.floor(w)
+        s, t = u - 0.5 - column, v - 0.5 - line
+        scale = abs(n[axis]) / (texel * texel)
+        for i in range(4):
+            across = _blur(i, s)
+            for j in range(4):
+                share = scale * across * _blur(j, t)
+                for k in range(-1, 2):
+                    slot = _slot(table.keys, _key(level, side, column + i - 1, line + j - 1, layer + k))
+                    if table.keys[slot] != _EMPTY:
+                        r += share * table.flux[slot, 0]
+                        g += share * table.flux[slot, 1]
+                        b += share * table.flux[slot, 2]
+    return (r, g, b)
+
+
+@inlined
+def _blur(i: int, s: float) -> float:
+    """Weight of texel `i` of four around a place that lies `s` between the middle two: 1-2-1, interpolated."""
+    left = _FILTER[i] if i < 3 else 0.0
+    right = _FILTER[i - 1] if i > 0 else 0.0
+    return left * (1.0 - s) + right * s
+
+
+@inlined
+def _within(table: Caustics, p: Vec) -> bool:
+    x = table.low[0] <= p[0] <= table.high[0]
+    return x and table.low[1] <= p[1] <= table.high[1] and table.low[2] <= p[2] <= table.high[2]
