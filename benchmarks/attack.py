@@ -209,10 +209,11 @@ def _half_heads(siege: Siege, tally: Tally, count: int) -> None:
             except OSError as error:
                 tally.event("head", f"not taken: {type(error).__name__}")
         _meanwhile(siege, tally)
+    end = time.monotonic() + 30.0
     for answer in asked:
         tally.answer("asks", answer.status_code, answer.text)
         if answer.status_code == 202:
-            _how_it_ended(siege, tally, answer.headers["location"])
+            _how_it_ended(siege, tally, answer.headers["location"], end)
 
 
 def _meanwhile(siege: Siege, tally: Tally) -> None:
@@ -330,13 +331,20 @@ def _long_job(siege: Siege) -> str:
     return where
 
 
-def _how_it_ended(siege: Siege, tally: Tally, where: str) -> None:
-    start = time.monotonic()
+def _how_it_ended(siege: Siege, tally: Tally, where: str, end: float = 0.0) -> None:
+    """`end`: of patience, by `time.monotonic`; 0 is in half a minute."""
+    end = end or time.monotonic() + 30.0
     with siege.client() as client:
-        while (job := client.get(where).json())["status"] not in ("done", "failed", "cancelled"):
-            if time.monotonic() - start > 30.0:
-                return tally.event("job", f"still {job['status']}", fault=True)
-            time.sleep(0.02)
+        while True:
+            try:
+                job = client.get(where, timeout=10.0).json()
+            except httpx.HTTPError as error:
+                job = {"status": f"not told: {type(error).__name__}"}
+            if job["status"] in ("done", "failed", "cancelled"):
+                break
+            if time.monotonic() > end:
+                return tally.event("job", f"a job is still {job['status']}", fault=True)
+            time.sleep(0.05)
     tally.event("job", (job["problem"] or {"type": job["status"]})["type"].removeprefix("/problems/"))
 
 
@@ -462,7 +470,7 @@ def _row(name: str, attack: Attack, folder: Path, options: Options, **how: Any) 
         before = siege.held()
         attack(siege, tally, options)
         recovery = siege.recovered(RECOVERY)
-        after = siege.settled(before)
+        after = siege.settled(before, well=recovery is not None)
     return Row(name, tally, tuple(leaks(before, after)), after.memory - before.memory, recovery)
 
 

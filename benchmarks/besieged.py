@@ -160,9 +160,9 @@ class Siege:
         files = sum(1 for place in (self.data / "work", self.temporary) for _ in place.rglob("*"))
         return Held(len(every), sum(map(_descriptors, every)), files, _shared(), sum(map(_memory, every)))
 
-    def settled(self, before: Held) -> Held:
-        """What it holds when all is done: the least of what is seen for a while."""
-        self.idle()
+    def settled(self, before: Held, *, well: bool = True) -> Held:
+        """What it holds when all is done. `well`: it does jobs, so that there is something to wait for."""
+        self.idle(PATIENCE if well else 5.0)
         end = time.monotonic() + _SETTLE
         while True:
             now = self.held()
