@@ -32,7 +32,6 @@ import json
 import os
 import random
 import signal
-import socket
 import subprocess
 import tempfile
 import threading
@@ -48,7 +47,7 @@ import httpx
 from refract_core.errors import UsageError
 
 from . import hostile, pages
-from .besieged import ATTACKER, QUICK, Siege, Tally, besieged, fresh, leaks, many_sockets
+from .besieged import QUICK, Siege, Tally, besieged, cpu_seconds, fresh, leaks, many_sockets
 from .hostile import Protocol
 
 PAGE = pages.ROOT / "docs" / "attack.md"
@@ -124,26 +123,16 @@ def _bombs(make: Callable[[], Mapping[str, bytes]]) -> Callable[[Siege, Tally, O
     def attack(siege: Siege, tally: Tally, options: Options) -> None:
         spent = 0.0
         for name, content in list(make().items())[: options.bombs]:
-            before = _spent(siege)
+            before = cpu_seconds(siege)
             start = time.monotonic()
             _post(siege, tally, name, "render", content)
-            used = max(_spent(siege) - before, 0.0)
+            used = max(cpu_seconds(siege) - before, 0.0)
             if used > spent:
                 spent, worst = used, f"{used:.1f} CPU s at most ({name}, {time.monotonic() - start:.0f} s)"
         if spent:
             tally.notes.append(worst)
 
     return attack
-
-
-def _spent(siege: Siege) -> float:
-    """CPU seconds of workers that have ended, and of what runs [s]."""
-    total = 0.0
-    for pid in siege.family():
-        with contextlib.suppress(OSError):
-            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-            total += sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
-    return total
 
 
 def protocol(siege: Siege, tally: Tally, options: Options) -> None:
@@ -153,7 +142,7 @@ def protocol(siege: Siege, tally: Tally, options: Options) -> None:
 
 def _raw(siege: Siege, tally: Tally, name: str, one: Protocol) -> None:
     said, ended = b"", False
-    with _connected(siege) as connection:
+    with siege.connect() as connection:
         connection.settimeout(45.0)  # more than header_seconds and body_seconds
         with contextlib.suppress(OSError):
             connection.sendall(one.sent)
@@ -179,10 +168,6 @@ def _raw(siege: Siege, tally: Tally, name: str, one: Protocol) -> None:
         tally.faults.append(f"{name}: the connection stays open")
 
 
-def _connected(siege: Siege) -> socket.socket:
-    return socket.create_connection(siege.address, 15.0, (ATTACKER, 0))
-
-
 def escapes(siege: Siege, tally: Tally, options: Options) -> None:
     """`tests/test_service_escape.py` has `attempts()`: name -> what the process that tried says of it, '' where it was
     refused. It locks processes of its own as a worker is, since no request makes a worker run code."""
@@ -203,7 +188,7 @@ def _half_heads(siege: Siege, tally: Tally, count: int) -> None:
     with contextlib.ExitStack() as stack:
         for _ in range(count):
             try:
-                connection = stack.enter_context(_connected(siege))
+                connection = stack.enter_context(siege.connect())
                 connection.sendall(b"POST /v1/render HTTP/1.1\r\nHost: localhost\r\nX-Slow: ")
                 tally.event("head", "half sent")
             except OSError as error:
@@ -241,7 +226,7 @@ def bodies(siege: Siege, tally: Tally, options: Options) -> None:
     stop = threading.Event()
 
     def trickle() -> None:
-        with _connected(siege) as connection:
+        with siege.connect() as connection:
             connection.settimeout(1.0)
             said, end = b"", time.monotonic() + 60.0
             with contextlib.suppress(OSError):

@@ -8,6 +8,7 @@ import os
 import re
 import resource
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -111,6 +112,9 @@ class Siege:
         limits = httpx.Limits(max_connections=None, max_keepalive_connections=0)
         transport = httpx.HTTPTransport(local_address=source, limits=limits)
         return httpx.Client(base_url=self.url, timeout=timeout, transport=transport, trust_env=False)
+
+    def connect(self, source: str = ATTACKER, timeout: float = 15.0) -> socket.socket:
+        return socket.create_connection(self.address, timeout, (source, 0))
 
     # --- the honest client
 
@@ -276,6 +280,16 @@ def _shared() -> int:
     posix = sum(len(os.listdir(place)) for place in ("/dev/shm", "/dev/mqueue") if Path(place).is_dir())
     tables = [Path(f"/proc/sysvipc/{name}") for name in ("shm", "sem", "msg")]
     return posix + sum(max(0, len(table.read_text().splitlines()) - 1) for table in tables if table.is_file())
+
+
+def cpu_seconds(siege: Siege) -> float:
+    """Processor time of what runs, and of workers that have ended [s]."""
+    total = 0.0
+    for pid in siege.family():
+        with contextlib.suppress(OSError):
+            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+            total += sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
+    return total
 
 
 def leaks(before: Held, after: Held) -> Sequence[str]:
