@@ -282,7 +282,7 @@ def over_time(found: Soaked) -> str:
     memory = [statistics.median(one.memory for one in part) / 2**20 for part in (first, last)]
     files = [statistics.median(one.descriptors for one in part) for part in (first, last)]
     most = max(one.memory for one in found.held) / 2**20
-    return (f"Memory: {memory[0]:.0f} MiB in the first quarter of the time, {memory[1]:.0f} MiB in the last, {most:.0f} "
+    return (f"Memory: {memory[0]:.0f} MiB in the first quarter of the time, {memory[1]:.0f} in the last, {most:.0f} "
             f"at most. Descriptors: {files[0]:.0f}, {files[1]:.0f}.")  # fmt: skip
 
 
