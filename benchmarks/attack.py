@@ -47,7 +47,7 @@ import httpx
 from refract_core.errors import UsageError
 
 from . import hostile, pages
-from .besieged import QUICK, Siege, Tally, besieged, cpu_seconds, fresh, leaks, many_sockets
+from .besieged import QUICK, Siege, Tally, besieged, cpu_seconds, end_in_order, fresh, leaks, many_sockets
 from .hostile import Protocol
 
 PAGE = pages.ROOT / "docs" / "attack.md"
@@ -508,6 +508,7 @@ def _names(text: str) -> tuple[str, ...]:
 
 def main() -> None:
     """Print the table, and write it where asked to. Ends with 1 where something must not be."""
+    end_in_order()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--parts", type=_names, default=tuple(PARTS))
     parser.add_argument("--mutants", type=int, default=Options().mutants)

@@ -242,6 +242,11 @@ os.execv(sys.argv[2], sys.argv[2:])
 """
 
 
+def end_in_order() -> None:
+    """Let SIGTERM end this program as Ctrl-C does, so that no service of its own is left."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+
 def many_sockets() -> int:
     """Let this process have as many descriptors as it may. Returns how many."""
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)

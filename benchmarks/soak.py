@@ -38,7 +38,7 @@ import refract_core as rc
 
 from . import pages
 from .attack import PAGE
-from .besieged import ATTACKER, GOOD, HONEST, STAGE, Held, Siege, besieged, cpu_seconds, fresh
+from .besieged import ATTACKER, GOOD, HONEST, STAGE, Held, Siege, besieged, cpu_seconds, end_in_order, fresh
 
 SIZE = {"image_width": 320, "image_height": 180, "samples": 1}
 _TURNS = 3
@@ -288,6 +288,7 @@ def over_time(found: Soaked) -> str:
 
 def main() -> None:
     """Print the table, and write it where asked to. Ends with 1 where something must not be."""
+    end_in_order()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--write", action="store_true", help=f"into {PAGE.relative_to(pages.ROOT)}")
