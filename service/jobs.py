@@ -24,6 +24,8 @@ from .limits import Limits
 from .metrics import Metrics
 from .pool import Source, Worker
 from .problems import KINDS, Problem
+from .shortage import problem_of
+from .slots import Ready, Slots
 from .store import Record, Store, now
 
 log = logging.getLogger("refract.service")
@@ -74,13 +76,15 @@ class Jobs:
         self._news: dict[str, asyncio.Event] = {}
         self._tasks: list[asyncio.Task[None]] = []
         self._usual = 1.0
+        self.slots = Slots(workers, self._one, metrics)
+        self._unsaved: set[str] = set()
+        """Jobs whose end could not be written down yet."""
 
     # --- life -------------------------------------------------------------------------------------------------------
 
     def start(self) -> None:
         self.source.start()
-        self._tasks = [asyncio.create_task(self._slot()) for _ in range(self.workers)]
-        self._tasks.append(asyncio.create_task(self._sweep()))
+        self._tasks = [*self.slots.start(), asyncio.create_task(self._sweep())]
 
     async def stop(self) -> None:
         """Let what is under way finish, for a while."""
@@ -128,9 +132,13 @@ class Jobs:
             return known
         self.store.remove(identifier)
         record = Record(identifier, kind, settings, stage, upload is not None)
-        self.store.save(record)
-        if upload:
-            os.replace(upload, self.store.folder(identifier) / stage)
+        try:
+            self.store.save(record)
+            if upload:
+                os.replace(upload, self.store.folder(identifier) / stage)
+        except OSError:
+            self.store.remove(identifier)
+            raise
         self._kept.discard(identifier)
         self.records[identifier] = record
         self._active.add(identifier)
@@ -181,26 +189,39 @@ class Jobs:
 
     # --- work -------------------------------------------------------------------------------------------------------
 
-    async def _slot(self) -> None:
-        """One worker after the other, each made before there is a job for it."""
-        while True:
-            worker, work = await self.source.fork(), self.store.new_work()
-            record = None
+    async def _one(self, ready: Ready) -> None:
+        """One job, by a worker that is made before there is a job for it."""
+        worker = await self.source.fork()
+        try:
+            work = self.store.new_work()
+        except BaseException:
+            await self._dismiss(worker)
+            raise
+        ready()
+        record = None
+        try:
+            while record is None or record.ended:
+                record = self.records.get(await self._line.get())
+            worker = await self._begin(record, worker, work)
+            await self._run(record, worker, work)
+        except Exception as error:
+            log.exception("a job failed in the server")
+            if record is not None and not record.ended:
+                problem = problem_of(error) or Problem("internal", "the service could not do this job")
+                self._end(record, "failed", problem)
+        finally:
+            if record is not None:
+                worker = self._given.pop(id(record), worker)
             try:
-                while record is None or record.ended:
-                    record = self.records.get(await self._line.get())
-                worker = await self._begin(record, worker, work)
-                await self._run(record, worker, work)
-            except Exception:
-                log.exception("a job failed in the server")
-                if record is not None and not record.ended:
-                    self._end(record, "failed", Problem("internal", "the service could not do this job"))
+                await self._dismiss(worker)
             finally:
-                if record is not None:
-                    self._given.pop(id(record), None)
-                await self.source.kill(worker)
-                worker.close()
                 self.store.drop_work(work)
+
+    async def _dismiss(self, worker: Worker) -> None:
+        try:
+            await self.source.kill(worker)
+        finally:
+            worker.close()
 
     async def _begin(self, record: Record, worker: Worker, work: Path) -> Worker:
         """Give a job to a worker; to another one where it ended while it waited, which is not the job's fault."""
@@ -213,13 +234,16 @@ class Jobs:
             "kind": record.kind, "stage": record.stage, "root": str(root), "folder": str(work),
             "settings": {**record.settings, "threads": threads}, "limits": asdict(self.limits),
         }  # fmt: skip
+        wait = 0.0
         while True:
             self._given[id(record)] = worker
             with contextlib.suppress(ConnectionError):
                 await worker.give(order)
                 if await worker.hear() == {"began": True} or record.ended:
                     return worker
-            worker.close()
+            await self._dismiss(worker)
+            await asyncio.sleep(wait)
+            wait = min(2 * wait + 0.05, 2.0)
             worker = await self.source.fork()
 
     async def _run(self, record: Record, worker: Worker, work: Path) -> None:
@@ -259,7 +283,7 @@ class Jobs:
         done: dict[str, Any] | None = None
         while message := await worker.hear():
             if "problem" in message:
-                return _problem_of(message["problem"])
+                return self._problem_of(record, message["problem"], work)
             if "done" in message:
                 done = message["done"]
                 break
@@ -278,6 +302,16 @@ class Jobs:
             return Problem("interrupted", "the service had to start its workers anew")
         self.metrics.crashes.inc()
         return _crash_of(record, code, work)
+
+    def _problem_of(self, record: Record, message: Any, work: Path) -> Problem:
+        """A worker's own words, with what only the server can know about them."""
+        problem = _problem_of(message)
+        if problem.slug == "worker-fault":
+            self.metrics.faults.inc()
+            log.error("job %s: a fault of this program\n%s", record.id, _last_words(work))
+        if problem.slug == "no-space" and self.store.free() > self.limits.result_bytes:
+            return Problem("limit-exceeded", "the files of the job are larger than this service allows")
+        return problem
 
     def _progress(self, record: Record, message: dict[str, Any]) -> None:
         if isinstance(message.get("progress"), int | float) and math.isfinite(message["progress"]):
@@ -299,10 +333,19 @@ class Jobs:
         self._active.discard(record.id)
         self._count()
         self.metrics.jobs.labels(record.kind, problem.slug if problem else status).inc()
-        with contextlib.suppress(OSError):
-            self.store.drop_stage(record)
-            self.store.save(record)
+        self._unsaved.add(record.id)
+        self._save_ends()
         self._tell(record)
+
+    def _save_ends(self) -> None:
+        """Write down how jobs ended; where the disk is full, when there is room again."""
+        for identifier in list(self._unsaved):
+            with contextlib.suppress(OSError):
+                record = self.records.get(identifier)
+                if record is not None and record.ended:
+                    self.store.drop_stage(record)
+                    self.store.save(record)
+                self._unsaved.discard(identifier)
 
     def _count(self) -> None:
         self.metrics.running.set(len(self._running))
@@ -315,11 +358,14 @@ class Jobs:
             await asyncio.sleep(_SWEEP)
             try:
                 self.sweep()
-            except OSError:
+            except Exception:  # the next round may do better; without any, the disk would fill
                 log.exception("old jobs could not be removed")
 
     def sweep(self) -> None:
         """End jobs that have waited too long; remove results that are too old, or too much."""
+        with contextlib.suppress(OSError):  # the rest of this makes room
+            self.store.drop_leavings()
+        self._save_ends()
         longest = timedelta(seconds=self.limits.queue_seconds)
         for identifier in list(self._active):
             record = self.records[identifier]
@@ -350,11 +396,15 @@ def _problem_of(message: Any) -> Problem:
     return Problem("stage-crashed", "the worker ended without an answer")
 
 
+def _last_words(work: Path) -> str:
+    with contextlib.suppress(OSError):
+        return (work / "worker.log").read_text("utf-8", "replace")[-4000:]
+    return ""
+
+
 def _crash_of(record: Record, code: int, work: Path) -> Problem:
     """What the end of a worker means to the client; its last words are for the log alone."""
-    said = ""
-    with contextlib.suppress(OSError):
-        said = (work / "worker.log").read_text("utf-8", "replace")[-4000:]
+    said = _last_words(work)
     log.warning("job %s: worker ended with %d\n%s", record.id, code, said)
     if code in (-24, -25) or (code == -9 and "CPU" in said):
         return Problem("time-limit", "the job used more processor time than this service allows")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -19,6 +20,7 @@ from .problems import Problem
 ENDED = ("done", "failed", "cancelled")
 RESULTS = re.compile(r"^(image\.(png|exr)|aov\.[A-Za-z_.]+\.png|report\.json|converted\.usdz)$")
 _ID = re.compile(r"^[0-9a-f]{64}$")
+_WORK = re.compile(r"^[0-9a-f]{16}$")
 
 
 def now() -> str:
@@ -68,8 +70,12 @@ class Record:
 def make_work(parent: Path) -> Path:
     """A worker's folder: what comes in, what goes out, and scratch."""
     folder = parent / secrets.token_hex(8)
-    for part in ("in", "out", "tmp"):
-        (folder / part).mkdir(parents=True, mode=0o700)
+    try:
+        for part in ("in", "out", "tmp"):
+            (folder / part).mkdir(parents=True, mode=0o700)
+    except OSError:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
     return folder
 
 
@@ -81,6 +87,8 @@ class Store:
         self.jobs.mkdir(parents=True, exist_ok=True, mode=0o700)
         shutil.rmtree(self.work, ignore_errors=True)  # of workers that are gone
         self.work.mkdir(mode=0o700)
+        self._given: set[Path] = set()
+        """Workers' folders in use."""
 
     def folder(self, identifier: str) -> Path:
         return self.jobs / identifier
@@ -89,8 +97,12 @@ class Store:
         folder = self.folder(record.id)
         folder.mkdir(exist_ok=True, mode=0o700)
         temporary = folder / f".{secrets.token_hex(4)}"
-        temporary.write_text(json.dumps(asdict(record), allow_nan=False), "utf-8")
-        os.replace(temporary, folder / "record.json")
+        try:
+            temporary.write_text(json.dumps(asdict(record), allow_nan=False), "utf-8")
+            os.replace(temporary, folder / "record.json")
+        except OSError:
+            temporary.unlink(missing_ok=True)
+            raise
 
     def load_all(self) -> dict[str, Record]:
         """Every job there is; those that were under way when the service ended have failed."""
@@ -110,8 +122,10 @@ class Store:
                 problem = Problem("interrupted", "the service ended while the job was waiting or running")
                 record.status, record.finished = "failed", now()
                 record.problem = problem.document(f"/v1/jobs/{record.id}")
-                self.save(record)
                 self.drop_stage(record)
+                self.drop_results(record)
+                with contextlib.suppress(OSError):  # of a full disk; it is told all the same
+                    self.save(record)
             found[record.id] = record
         return found
 
@@ -126,6 +140,11 @@ class Store:
     def size(self, identifier: str) -> int:
         return sum(entry.stat().st_size for entry in os.scandir(self.folder(identifier)) if entry.is_file())
 
+    def free(self) -> int:
+        """Room for further files [bytes]; 0 where no file can be made."""
+        found = os.statvfs(self.work)
+        return found.f_bavail * found.f_frsize if found.f_favail or not found.f_files else 0
+
     def writable(self) -> bool:
         try:
             with tempfile.TemporaryFile(dir=self.work) as file:
@@ -137,13 +156,32 @@ class Store:
     # --- a worker's folder ------------------------------------------------------------------------------------------
 
     def new_work(self) -> Path:
-        return make_work(self.work)
+        work = make_work(self.work)
+        self._given.add(work)
+        return work
 
     def take_results(self, work: Path, record: Record) -> None:
-        """Move what a worker wrote into the job's folder: plain files of known names, nothing else."""
-        for entry in os.scandir(work / "out"):
-            if RESULTS.match(entry.name) and stat.S_ISREG(entry.stat(follow_symlinks=False).st_mode):
-                os.replace(entry.path, self.folder(record.id) / entry.name)
+        """Move what a worker wrote into the job's folder: plain files of known names, nothing else, and all or none."""
+        try:
+            for entry in os.scandir(work / "out"):
+                if RESULTS.match(entry.name) and stat.S_ISREG(entry.stat(follow_symlinks=False).st_mode):
+                    os.replace(entry.path, self.folder(record.id) / entry.name)
+        except OSError:
+            with contextlib.suppress(OSError):
+                self.drop_results(record)
+            raise
+
+    def drop_results(self, record: Record) -> None:
+        for path in self.folder(record.id).iterdir():
+            if RESULTS.match(path.name):
+                path.unlink(missing_ok=True)
 
     def drop_work(self, work: Path) -> None:
         shutil.rmtree(work, ignore_errors=True)
+        self._given.discard(work)
+
+    def drop_leavings(self) -> None:
+        """Remove workers' folders that could not be removed at once, such as when no descriptor was free for it."""
+        for path in self.work.iterdir():
+            if _WORK.match(path.name) and path not in self._given:
+                shutil.rmtree(path, ignore_errors=True)
