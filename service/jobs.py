@@ -11,7 +11,7 @@ import math
 import os
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -19,7 +19,9 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from .digests import engine
+from .bodies import own_stage
+from .digests import engine, file_digest, tree_digest
+from .discreet import own_folders, without_folders
 from .limits import Limits
 from .metrics import Metrics
 from .pool import Source, Worker
@@ -76,6 +78,7 @@ class Jobs:
         self._news: dict[str, asyncio.Event] = {}
         self._tasks: list[asyncio.Task[None]] = []
         self._usual = 1.0
+        self._hidden = {*own_folders(), str(store.jobs.parent), *([str(stage_root)] if stage_root else ())}
         self.slots = Slots(workers, self._one, metrics)
         self._unsaved: set[str] = set()
         """Jobs whose end could not be written down yet."""
@@ -84,20 +87,50 @@ class Jobs:
 
     def start(self) -> None:
         self.source.start()
-        self._tasks = [*self.slots.start(), asyncio.create_task(self._sweep())]
+        self._tasks = [*self.slots.start(), asyncio.create_task(self._sweep()), asyncio.create_task(self._resume())]
 
     async def stop(self) -> None:
-        """Let what is under way finish, for a while."""
+        """Let what is under way finish, for a while. What still waits then and is kept waits for the next start."""
         self.draining = True
         deadline = time.monotonic() + self.limits.drain_seconds
         while self._active and time.monotonic() < deadline:
             await asyncio.sleep(0.05)
-        for identifier in list(self._active):
-            self._end(self.records[identifier], "failed", Problem("interrupted", "the service was stopped"))
+        for record in [self.records[identifier] for identifier in self._active]:
+            if not (record.kept and record.status == "queued"):
+                self._end(record, "failed", Problem("interrupted", "the service was stopped"))
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         await self.source.stop()
+
+    async def _resume(self) -> None:
+        """Queue what waited when the service ended, unless it would not be the same job any more."""
+        for record in [one for one in self.records.values() if one.status == "queued" and one.id not in self._active]:
+            try:
+                same = await asyncio.to_thread(self._identity_now, record) == record.id
+            except (OSError, Problem):  # the stage is gone, or half of it is
+                same = False
+            if record.ended:
+                continue
+            self._active.add(record.id)
+            if not same:
+                text = "the service ended while the job was waiting, and its stage is not there any more"
+                self._end(record, "failed", Problem("interrupted", text))
+                continue
+            record.created = now()  # the time it may wait begins anew
+            self._kept.add(record.id)
+            self._count()
+            self._line.put_nowait(record.id)
+
+    def _identity_now(self, record: Record) -> str:
+        """What the id of a job would be if it came in now."""
+        if record.uploaded:
+            digest = file_digest(self.store.folder(record.id) / record.stage)
+        else:
+            if self.stage_root is None or own_stage(self.stage_root, record.stage) != record.stage:
+                return ""
+            digest = tree_digest(self.stage_root, record.stage)
+        return _identity(record.kind, digest, record.settings)
 
     # --- in ---------------------------------------------------------------------------------------------------------
 
@@ -124,8 +157,7 @@ class Jobs:
             stage: path under the stage root, or the name the uploaded file shall have.
             upload: the uploaded file, which is moved; None for a stage of ours.
         """
-        wish = json.dumps([kind, engine(), digest, settings], sort_keys=True, allow_nan=False)
-        identifier = hashlib.sha256(wish.encode()).hexdigest()
+        identifier = _identity(kind, digest, settings)
         known = self.records.get(identifier)
         if known and known.status in ("queued", "running", "done"):
             self.metrics.cached.inc()
@@ -149,8 +181,12 @@ class Jobs:
     # --- listening --------------------------------------------------------------------------------------------------
 
     def keep(self, record: Record) -> None:
-        """Finish this job even if nobody waits for it."""
+        """Finish this job even if nobody waits for it, and after a restart of the service if need be."""
         self._kept.add(record.id)
+        if not record.kept and record.status == "queued":
+            record.kept = True
+            with contextlib.suppress(OSError):  # of a full disk: after a restart it is told as interrupted
+                self.store.save(record)
 
     @contextlib.asynccontextmanager
     async def waiting(self, record: Record) -> AsyncIterator[None]:
@@ -303,9 +339,12 @@ class Jobs:
         self.metrics.crashes.inc()
         return _crash_of(record, code, work)
 
+    def _discreet(self, text: Any) -> str:
+        return without_folders(str(text)[:10_000], self._hidden)
+
     def _problem_of(self, record: Record, message: Any, work: Path) -> Problem:
         """A worker's own words, with what only the server can know about them."""
-        problem = _problem_of(message)
+        problem = _problem_of(message, self._discreet)
         if problem.slug == "worker-fault":
             self.metrics.faults.inc()
             log.error("job %s: a fault of this program\n%s", record.id, _last_words(work))
@@ -316,12 +355,13 @@ class Jobs:
     def _progress(self, record: Record, message: dict[str, Any]) -> None:
         if isinstance(message.get("progress"), int | float) and math.isfinite(message["progress"]):
             fraction = round(min(max(float(message["progress"]), record.fraction), 1.0), 4)
-            step = (fraction, str(message.get("stage", ""))[:200])
+            step = (fraction, self._discreet(message.get("stage", ""))[:200])
             if step[1] == record.stage_of_work and fraction - record.fraction < 0.01:
                 return
             record.fraction, record.stage_of_work = step
         elif "warning" in message and len(record.warnings) < self.limits.warnings:
-            record.warnings.append({"path": str(message.get("path"))[:500], "text": str(message["warning"])[:500]})
+            path, text = (self._discreet(message.get(name))[:500] for name in ("path", "warning"))
+            record.warnings.append({"path": path, "text": text})
         self._tell(record)
 
     def _end(self, record: Record, status: str, problem: Problem | None) -> None:
@@ -384,16 +424,21 @@ class Jobs:
                 self._kept.discard(record.id)
 
 
-def _problem_of(message: Any) -> Problem:
+def _problem_of(message: Any, discreet: Callable[[Any], str]) -> Problem:
     """A worker's own words, if they are in order."""
     if isinstance(message, dict) and message.get("slug") in KINDS and isinstance(message.get("detail"), str):
         errors = [
-            {"pointer": str(one.get("pointer"))[:1100], "detail": str(one.get("detail"))[:500]}
+            {"pointer": discreet(one.get("pointer"))[:1100], "detail": discreet(one.get("detail"))[:500]}
             for one in message.get("errors") or [] if isinstance(one, dict)
         ]  # fmt: skip
-        return Problem(message["slug"], message["detail"][:1000], errors=errors[:20],
-                       prim=str(message.get("prim") or "")[:1024])  # fmt: skip
+        return Problem(message["slug"], discreet(message["detail"])[:1000], errors=errors[:20],
+                       prim=discreet(message.get("prim") or "")[:1024])  # fmt: skip
     return Problem("stage-crashed", "the worker ended without an answer")
+
+
+def _identity(kind: str, digest: str, settings: dict[str, Any]) -> str:
+    wish = json.dumps([kind, engine(), digest, settings], sort_keys=True, allow_nan=False)
+    return hashlib.sha256(wish.encode()).hexdigest()
 
 
 def _last_words(work: Path) -> str:

@@ -10,6 +10,7 @@ import secrets
 import shutil
 import stat
 import tempfile
+import time
 from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,6 +21,7 @@ from .problems import Problem
 ENDED = ("done", "failed", "cancelled")
 RESULTS = re.compile(r"^(image\.(png|exr)|aov\.[A-Za-z_.]+\.png|report\.json|converted\.usdz)$")
 _ID = re.compile(r"^[0-9a-f]{64}$")
+_FORGOTTEN = 3600.0  # [s]
 _WORK = re.compile(r"^[0-9a-f]{16}$")
 
 
@@ -37,6 +39,8 @@ class Record:
     stage: str
     """Name of the uploaded file in the job's folder, or the path of a stage under the stage root."""
     uploaded: bool
+    kept: bool = False
+    """It is to be finished even if nobody waits for it."""
     status: str = "queued"
     fraction: float = 0.0
     stage_of_work: str = "waiting"
@@ -105,7 +109,8 @@ class Store:
             raise
 
     def load_all(self) -> dict[str, Record]:
-        """Every job there is; those that were under way when the service ended have failed."""
+        """Every job there is. Those that were under way when the service ended have failed; those that only waited,
+        and are to be finished, still wait."""
         found: dict[str, Record] = {}
         known = {one.name for one in fields(Record)}
         for folder in sorted(self.jobs.iterdir()):
@@ -118,7 +123,7 @@ class Store:
             if not _ID.match(record.id) or record.id != folder.name:
                 shutil.rmtree(folder, ignore_errors=True)
                 continue
-            if not record.ended:
+            if not record.ended and not (record.kept and record.status == "queued"):
                 problem = Problem("interrupted", "the service ended while the job was waiting or running")
                 record.status, record.finished = "failed", now()
                 record.problem = problem.document(f"/v1/jobs/{record.id}")
@@ -181,7 +186,10 @@ class Store:
         self._given.discard(work)
 
     def drop_leavings(self) -> None:
-        """Remove workers' folders that could not be removed at once, such as when no descriptor was free for it."""
+        """Remove workers' folders that could not be removed at once, such as when no descriptor was free for it, and
+        uploads that nobody has fetched for an hour."""
         for path in self.work.iterdir():
             if _WORK.match(path.name) and path not in self._given:
                 shutil.rmtree(path, ignore_errors=True)
+            elif path.name.startswith("upload-") and time.time() - path.stat().st_mtime > _FORGOTTEN:
+                shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)

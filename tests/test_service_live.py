@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import json
+import logging
 import os
 import re
 import resource
@@ -24,8 +25,11 @@ from service_server import BALL, PATIENCE, ROOT, SMALL, InProcess, Server, runni
 
 from refract_core.errors import UsageError
 from service.app import Settings, create_app
+from service.digests import file_digest, tree_digest
+from service.discreet import without_folders
 from service.gate import Gate, fitting
 from service.jobs import Jobs
+from service.journal import Seldom
 from service.limits import Limits
 from service.metrics import Metrics
 from service.pool import Nursery, Worker
@@ -299,3 +303,305 @@ def test_the_gate_lets_go_of_who_waits_longest() -> None:
         assert gate.enter(fourth)
 
     asyncio.run(work())
+
+
+# --- the disk
+
+_MOUNT = 'mount -t tmpfs -o "$1" tmpfs "$2" && shift 2 && exec "$@"'
+_CAN_MOUNT = bool(shutil.which("unshare")) and not subprocess.run(
+    ["unshare", "-rm", "mount", "-t", "tmpfs", "tmpfs", "/mnt"], capture_output=True, check=False
+).returncode
+
+
+@contextmanager
+def on_small_disk(folder: Path, options: str, *words: str) -> Iterator[tuple[Server, Path]]:
+    """A service whose folders are on a disk of their own, and where that disk is seen from here."""
+    disk = folder / "disk"
+    disk.mkdir()
+    within = ["unshare", "-rm", "sh", "-c", _MOUNT, "sh", options, str(disk)]
+    places = {"TMPDIR": str(disk)}
+    with running(folder / "data", "--data", str(disk / "data"), "--workers", "1", *words, within=within,
+                 environment=places, own_data=False) as server:  # fmt: skip
+        yield server, Path(f"/proc/{server.process.pid}/root{disk}")
+
+
+def fill(disk: Path) -> Path:
+    """Take every byte that is left."""
+    ballast = disk / "ballast"
+    with suppress(OSError), open(ballast, "wb", buffering=0) as file:
+        while True:
+            file.write(b"x" * 4096)
+    return ballast
+
+
+def files_of(disk: Path) -> set[str]:
+    return {str(path.relative_to(disk)) for path in (disk / "data").rglob("*") if path.is_file()}
+
+
+@pytest.mark.skipif(not _CAN_MOUNT, reason="nothing may be mounted here")
+def test_a_full_disk_is_507_and_passes(tmp_path: Path) -> None:
+    with on_small_disk(tmp_path, "size=8m") as (server, disk), server.client() as client:
+        assert draws(server, 0.0)
+        known = files_of(disk)
+        ballast = fill(disk)
+        for n in range(3):
+            settings = json.dumps({**SMALL, "exposure": 1.0 + n})
+            answer = client.post("/v1/render", files=upload(BALL), data={"settings": settings})
+            assert (answer.status_code, answer.json()["type"]) == (507, "/problems/no-space")
+            assert int(answer.headers["retry-after"]) > 0
+            assert str(disk) not in answer.text
+        assert client.get("/readyz").status_code == 503
+        assert {name for name in files_of(disk) if name.startswith("data/jobs/")} == {
+            name for name in known if name.startswith("data/jobs/")
+        }
+        assert not [name for name in files_of(disk) if "upload" in name]
+        ballast.unlink()
+        until(lambda: draws(server, 1.0), SOON)
+        assert client.get("/readyz").status_code == 200
+
+
+@pytest.mark.skipif(not _CAN_MOUNT, reason="nothing may be mounted here")
+def test_a_result_that_finds_no_room_is_507(tmp_path: Path) -> None:
+    """The disk is full only when the worker writes: its picture is larger than what is left."""
+    with on_small_disk(tmp_path, "size=8m") as (server, disk), server.client() as client:
+        assert draws(server, 0.0)
+        ballast = fill(disk)
+        with open(ballast, "r+b") as file:
+            file.truncate(ballast.stat().st_size - 65536)  # enough for a stage and records
+        sent = {"settings": json.dumps({"image_width": 640, "samples": 1})}
+        exr = {"Accept": "image/x-exr"}
+        answer = client.post("/v1/render", files=upload(BALL), data=sent, headers=exr)
+        assert (answer.status_code, answer.json()["type"]) == (507, "/problems/no-space")
+        job = answer.headers["content-location"].rpartition("/")[2]
+        assert not [path for path in (disk / "data" / "jobs" / job).iterdir() if path.name != "record.json"]
+        ballast.unlink()
+        assert client.post("/v1/render", files=upload(BALL), data=sent, headers=exr).status_code == 200
+
+
+@pytest.mark.skipif(not _CAN_MOUNT, reason="nothing may be mounted here")
+def test_a_disk_without_inodes_is_507_and_passes(tmp_path: Path) -> None:
+    with on_small_disk(tmp_path, "size=64m,nr_inodes=200") as (server, disk), server.client() as client:
+        assert draws(server, 0.0)
+        (disk / "many").mkdir()
+        with suppress(OSError):
+            for n in range(1000):
+                (disk / "many" / str(n)).touch()
+        settings = json.dumps({**SMALL, "exposure": 1.0})
+        answer = client.post("/v1/render", files=upload(BALL), data={"settings": settings})
+        assert (answer.status_code, answer.json()["type"]) == (507, "/problems/no-space")
+        assert client.get("/readyz").status_code == 503
+        shutil.rmtree(disk / "many")
+        until(lambda: draws(server, 1.0), SOON)
+        assert client.get("/readyz").json()["slots"]["live"] == 1
+
+
+def test_two_services_do_not_share_a_folder(tmp_path: Path) -> None:
+    data = str(tmp_path / "data")
+    first = create_app(Settings(data=data))
+    job = first.state.jobs.store.new_work()
+    with pytest.raises(UsageError, match="another service uses this folder"):
+        create_app(Settings(data=data))
+    assert job.is_dir()
+    command = [sys.executable, "-m", "refract_core.cli", "serve", "--port", "0", "--data", data]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=PATIENCE)
+    assert done.returncode == 2
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert "another service uses this folder" in done.stderr
+    assert done.stdout == ""
+
+
+def test_a_queued_job_whose_stage_has_changed_is_told(tmp_path: Path) -> None:
+    """What was accepted is done or told, and never done on something else."""
+    root = tmp_path / "root"
+    root.mkdir()
+    (root / "a.usda").write_text(BALL)
+
+    async def first() -> tuple[str, str]:
+        jobs = jobs_of(tmp_path / "data", Fails([]))
+        jobs.stage_root = root
+        digest = file_digest(root / "a.usda")
+        same = jobs.submit("render", {"samples": 1}, digest, "stage.usda", copied(root / "a.usda"))
+        other = jobs.submit("render", {"samples": 1}, tree_digest(root, "a.usda"), "a.usda", None)
+        left = jobs.submit("render", {"samples": 2}, tree_digest(root, "a.usda"), "a.usda", None)
+        jobs.keep(same)
+        jobs.keep(other)
+        assert not left.kept  # whoever asked for it has lost the connection
+        return same.id, other.id
+
+    def copied(path: Path) -> Path:
+        return Path(shutil.copy(path, tmp_path / "upload"))
+
+    async def second(same: str, other: str) -> None:
+        jobs = Jobs(Store(tmp_path / "data"), Limits(), Metrics(), Nursery(), workers=1, queue=4, stage_root=root)
+        await jobs._resume()
+        states = {record.id: record.status for record in jobs.records.values()}
+        assert len(states) == 3
+        assert (states.pop(same), states.pop(other), *states.values()) == ("queued", "failed", "failed")
+        assert {r.problem["type"] for r in jobs.records.values() if r.problem} == {"/problems/interrupted"}
+
+    same, other = asyncio.run(first())
+    (root / "a.usda").write_text(BALL + "\n")
+    asyncio.run(second(same, other))
+
+
+# --- faults of ours, and what strangers are told
+
+
+class Says(Idle):
+    """A worker that says one thing."""
+
+    def __init__(self, message: dict[str, Any]) -> None:
+        super().__init__()
+        self.messages = [{"began": True}, message]
+
+    async def hear(self) -> dict[str, Any] | None:
+        return self.messages.pop(0) if self.messages else None
+
+
+def outcome(jobs: Jobs, source: Fails, message: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """The document of a job whose worker says this."""
+    assert jobs.stage_root is not None
+
+    async def fork() -> Any:
+        return Says(message)
+
+    async def work() -> dict[str, Any]:
+        monkeypatch.setattr(source, "fork", fork)
+        jobs.start()
+        record = jobs.submit("render", {"samples": 1}, "digest", "a.usda", None)
+        async with asyncio.timeout(PATIENCE):
+            await jobs.ended(record)
+        await jobs.stop()
+        return record.document()
+
+    return asyncio.run(work())
+
+
+def test_a_fault_of_ours_is_counted_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def make() -> tuple[Jobs, Fails]:
+        source = Fails([])
+        jobs = jobs_of(tmp_path, source, workers=1)
+        jobs.stage_root = tmp_path / "root"
+        return jobs, source
+
+    jobs, source = asyncio.run(make())
+    fault = {"problem": {"slug": "worker-fault", "detail": "the program failed on this stage"}}
+    document = outcome(jobs, source, fault, monkeypatch)
+    assert (document["problem"]["type"], document["problem"]["status"]) == ("/problems/worker-fault", 500)
+    assert sample(jobs.metrics, "refract_worker_faults_total") == 1.0
+    assert sample(jobs.metrics, "refract_worker_crashes_total") == 0.0
+
+
+def test_an_exception_in_a_worker_is_a_fault_of_ours(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """By the worker's own road: what it says of an exception that nothing in it has caught."""
+    from service import worker
+
+    known: list[tuple[BaseException, str]] = [
+        (RuntimeError("/secret/place"), "worker-fault"),
+        (OSError(errno.ENOSPC, "No space left on device"), "no-space"),
+        (OSError(errno.EFBIG, "File too large"), "limit-exceeded"),
+        (OSError(errno.EACCES, "Permission denied"), "worker-fault"),
+        (MemoryError(), "memory-limit"),
+    ]
+    for error, slug in known:
+
+        def fail(_job: Any, _say: Any, error: BaseException = error) -> Any:
+            raise error
+
+        monkeypatch.setattr(worker, "_perform", fail)
+        ours, theirs = socket.socketpair()
+        with ours, theirs:
+            ours.sendall(b"{}\n")
+            assert worker._serve(theirs.fileno()) == 0
+            said = [json.loads(line) for line in ours.recv(65536).splitlines()]
+        assert said[0] == {"began": True}
+        assert said[1]["problem"]["slug"] == slug
+        assert "secret" not in json.dumps(said)
+
+
+def test_no_document_names_a_folder_of_the_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def make() -> tuple[Jobs, Fails]:
+        source = Fails([])
+        jobs = jobs_of(tmp_path / "data", source, workers=1)
+        jobs.stage_root = tmp_path / "root"
+        return jobs, source
+
+    jobs, source = asyncio.run(make())
+    inner = f"{jobs.store.work}/0123/out/image.png: {sys.prefix}/lib/x.py, {ROOT}."
+    told = {"problem": {"slug": "stage-invalid", "detail": f"{inner}: cannot be written", "prim": f"{inner}",
+                        "errors": [{"pointer": inner, "detail": inner}]}}  # fmt: skip
+    said = json.dumps(outcome(jobs, source, told, monkeypatch))
+    for folder in (tmp_path, sys.prefix, ROOT):
+        assert str(folder) not in said
+    assert "image.png: " in said
+
+
+def test_a_result_above_its_limit_is_told_without_a_path(tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    root.mkdir()
+    (root / "a.usda").write_text(BALL)
+    words = ("--workers", "1", "--stage-root", str(root), "--limit", "result_bytes=2000")
+    with running(tmp_path / "data", *words) as server, server.client() as client:
+        for media in ("image/png", "image/x-exr"):
+            body = {"stage": "a.usda", "image_width": 200, "samples": 1}
+            answer = client.post("/v1/render", json=body, headers={"Accept": media})
+            assert (answer.status_code, answer.json()["type"]) == (422, "/problems/limit-exceeded")
+            assert str(tmp_path) not in answer.text
+
+
+def test_prims_keep_their_names_in_texts() -> None:
+    assert without_folders("/root/Glass: no normals", {"/root", "/"}) == "/root/Glass: no normals"
+    assert without_folders("/srv/jobs/work/a.png; /srv/jobs.", {"/srv/jobs"}) == "work/a.png; a folder."
+    assert without_folders("/srv/jobsworth/a", {"/srv/jobs"}) == "/srv/jobsworth/a"
+
+
+# --- the log
+
+
+def lines_of(server: Server) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in server.log.read_text().splitlines()]
+
+
+def test_each_request_is_a_line(tmp_path: Path) -> None:
+    with running(tmp_path / "data", "--workers", "1") as server, server.client() as client:
+        drawn = client.post("/v1/render", files=upload(BALL), data={"settings": json.dumps(SMALL)},
+                            headers={"X-Request-ID": "shop-1.2:3"})  # fmt: skip
+        assert drawn.headers["x-request-id"] == "shop-1.2:3"
+        odd = client.get("/nothing?key=secret", headers={"X-Request-ID": 'a"b\\c d'})
+        assert re.fullmatch("[0-9a-f]{16}", odd.headers["x-request-id"])
+        long = client.get("/livez", headers={"X-Request-ID": "x" * 129})
+        assert len(long.headers["x-request-id"]) == 16
+        found = {line["request_id"]: line for line in lines_of(server) if "request_id" in line}
+        line = found["shop-1.2:3"]
+        assert (line["method"], line["path"], line["status"]) == ("POST", "/v1/render", 200)
+        assert line["bytes"] == len(drawn.content)
+        assert line["job"] == drawn.headers["content-location"].rpartition("/")[2]
+        assert line["seconds"] > 0.0
+        line = found[odd.headers["x-request-id"]]
+        assert (line["path"], line["status"]) == ("/nothing", 404)
+        assert "secret" not in server.log.read_text()
+        text = client.get("/metrics").text
+    for name in ("process_open_fds", "process_resident_memory_bytes", "refract_connections", "refract_slots"):
+        assert re.search(rf"(?m)^{name}[{{ ]", text)
+
+
+def test_the_same_complaint_comes_once_a_second() -> None:
+    seldom, said = Seldom(), []
+
+    def complain(at: float, text: str) -> None:
+        record = logging.LogRecord("refract.service", logging.WARNING, "", 0, text, None, None)
+        record.created = at
+        if seldom.filter(record):
+            said.append(record.getMessage())
+
+    for n in range(100):
+        complain(10.0 + n / 40, "no room")
+    complain(12.0, "other")
+    assert said == ["no room", "no room (39 more like it)", "no room (39 more like it)", "other"]
+
+
+def test_text_is_for_people(tmp_path: Path) -> None:
+    with running(tmp_path / "data", "--log", "text") as server, server.client() as client:
+        client.get("/livez", headers={"X-Request-ID": "mine"})
+        line = re.compile(r"^INFO refract.requests: GET /livez 200 in [\d.e-]+ s, mine$", re.MULTILINE)
+        until(lambda: line.search(server.log.read_text()))
