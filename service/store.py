@@ -22,6 +22,8 @@ ENDED = ("done", "failed", "cancelled")
 RESULTS = re.compile(r"^(image\.(png|exr)|aov\.[A-Za-z_.]+\.png|report\.json|converted\.usdz)$")
 _ID = re.compile(r"^[0-9a-f]{64}$")
 _FORGOTTEN = 3600.0  # [s]
+_FILES_OF_JOB, _BYTES_OF_JOB = 32, 1 << 20
+"""The least that must be left for the service to call itself ready; a job may need far more."""
 _WORK = re.compile(r"^[0-9a-f]{16}$")
 
 
@@ -146,12 +148,16 @@ class Store:
         return sum(entry.stat().st_size for entry in os.scandir(self.folder(identifier)) if entry.is_file())
 
     def free(self) -> int:
-        """Room for further files [bytes]; 0 where no file can be made."""
+        """Room for further files [bytes]; 0 where there are fewer files left to make than a job needs."""
         found = os.statvfs(self.work)
-        return found.f_bavail * found.f_frsize if found.f_favail or not found.f_files else 0
+        enough = found.f_favail >= _FILES_OF_JOB or not found.f_files  # some file systems do not count them
+        return found.f_bavail * found.f_frsize if enough else 0
 
     def writable(self) -> bool:
+        """Whether there is room for the least that a job writes."""
         try:
+            if self.free() < _BYTES_OF_JOB:
+                return False
             with tempfile.TemporaryFile(dir=self.work) as file:
                 file.write(b"x")
         except OSError:
