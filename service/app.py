@@ -24,11 +24,14 @@ from refract_core.version import __version__
 
 from . import openapi, pages, routes
 from .edge import Edge
+from .holding import Hold
 from .jobs import Jobs
+from .journal import Journal
 from .limits import Limits
 from .metrics import CONTENT_TYPE, Metrics
 from .pool import Nursery, Source
 from .problems import BY_STATUS, KINDS, MEDIA_TYPE, Problem, respond
+from .shortage import problem_of
 from .store import Store
 
 log = logging.getLogger("refract.service")
@@ -76,6 +79,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     metrics = Metrics()
     data = Path(settings.data or mkdtemp(prefix="refract-service-")).resolve()
     try:
+        hold = Hold(data)
         store = Store(data)
     except OSError as error:
         raise UsageError(f"--data {settings.data}: cannot be used: {error.strerror}") from error
@@ -92,6 +96,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             yield
         finally:
             await jobs.stop()
+            hold.release()
             if not settings.data:
                 shutil.rmtree(data, ignore_errors=True)
 
@@ -101,6 +106,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )  # fmt: skip
     app.state.jobs, app.state.settings, app.state.metrics = jobs, settings, metrics
     app.add_middleware(Edge, tokens=settings.tokens, metrics=metrics)
+    app.add_middleware(Journal)  # around all others
     _add_handlers(app)
     _add_pages(app, settings, metrics)
     app.include_router(routes.router)
@@ -144,6 +150,13 @@ def _add_handlers(app: FastAPI) -> None:
     async def on_validation(request: Request, error: Exception) -> Response:
         return respond(Problem("invalid-settings", "a parameter of the path or query is not valid"))
 
+    async def on_os_error(request: Request, error: Exception) -> Response:
+        problem = problem_of(error)
+        if problem is None:
+            return await on_anything(request, error)
+        log.warning("a request is refused: %s", error.strerror if isinstance(error, OSError) else error)
+        return respond(problem)
+
     async def on_anything(request: Request, error: Exception) -> Response:
         identifier = getattr(request.state, "request_id", "")
         log.error("request %s failed", identifier, exc_info=error)
@@ -153,6 +166,7 @@ def _add_handlers(app: FastAPI) -> None:
     app.add_exception_handler(StarletteHTTPException, on_http)
     app.add_exception_handler(HTTPException, on_http)
     app.add_exception_handler(RequestValidationError, on_validation)
+    app.add_exception_handler(OSError, on_os_error)
     app.add_exception_handler(Exception, on_anything)
 
 
@@ -179,7 +193,10 @@ def _add_pages(app: FastAPI, settings: Settings, metrics: Metrics) -> None:
             raise Problem("unavailable", why, headers={"Retry-After": "2"})
         if not jobs.store.writable():
             raise Problem("unavailable", "the folder of jobs cannot be written", headers={"Retry-After": "30"})
-        return JSONResponse({"status": "ready", "confinement": jobs.source.report})
+        slots = {"live": jobs.slots.live, "of": jobs.slots.count}
+        if not jobs.slots.live:
+            raise Problem("unavailable", "no slot for jobs lives; they are started again", headers={"Retry-After": "2"})
+        return JSONResponse({"status": "ready", "slots": slots, "confinement": jobs.source.report})
 
     @app.get("/metrics", summary="For Prometheus", response_class=Response)
     async def prometheus() -> Response:

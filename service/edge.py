@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import hmac
 import re
-import secrets
 import time
 from collections.abc import Sequence
 from urllib.parse import urlsplit
@@ -13,6 +12,7 @@ from urllib.parse import urlsplit
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from .journal import request_id
 from .metrics import Metrics
 from .problems import MEDIA_TYPE, Problem, of_status, respond
 
@@ -39,7 +39,7 @@ class Edge:
         headers = Headers(scope=scope)
         unread = headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
         expects = headers.get("expect", "").lower() == "100-continue"
-        identifier = secrets.token_hex(8)
+        identifier = request_id(headers.get("x-request-id"))
         scope.setdefault("state", {})["request_id"] = identifier
         inner, answered = _for_the_app(scope), False
 
