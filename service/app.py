@@ -24,6 +24,7 @@ from refract_core.version import __version__
 
 from . import openapi, pages, routes
 from .edge import Edge
+from .hosts import door
 from .jobs import Jobs
 from .limits import Limits
 from .metrics import CONTENT_TYPE, Metrics
@@ -49,6 +50,12 @@ class Settings:
     """Jobs that may wait."""
     executor: str = ""
     """Address of a Dask cluster that does the jobs, `dask://HOST:PORT`; '' does them on this machine."""
+    host: str = ""
+    """Where it listens, `--host`; '' where another server listens for it."""
+    allow_hosts: tuple[str, ...] = ()
+    """Names that it answers to, beside `localhost` and `host`."""
+    allow_origins: tuple[str, ...] = ()
+    """Other sites whose pages may use it, such as `https://shop.example.org`."""
     tokens: tuple[str, ...] = ()
     """Bearer tokens, one of which every request under /v1 must bring; none means open to all."""
     limits: Limits = field(default_factory=Limits)
@@ -62,6 +69,7 @@ class Settings:
             scheduler_of(self.executor)
         if self.stage_root and not Path(self.stage_root).is_dir():
             raise UsageError(f"--stage-root {self.stage_root}: there is no such folder")
+        door(self.host, self.allow_hosts, self.allow_origins)
         if any(len(token) < 8 for token in self.tokens):
             raise UsageError("a bearer token is shorter than 8 characters; take a long random one")
 
@@ -100,7 +108,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         description="Renders USD stages with glass in them.", redirect_slashes=False,
     )  # fmt: skip
     app.state.jobs, app.state.settings, app.state.metrics = jobs, settings, metrics
-    app.add_middleware(Edge, tokens=settings.tokens, metrics=metrics)
+    entry = door(settings.host, settings.allow_hosts, settings.allow_origins)
+    app.add_middleware(Edge, door=entry, tokens=settings.tokens, metrics=metrics)
     _add_handlers(app)
     _add_pages(app, settings, metrics)
     app.include_router(routes.router)

@@ -14,7 +14,7 @@ from .problems import KINDS, MEDIA_TYPE
 Answers = dict[int | str, dict[str, Any]]
 _PROBLEM = {"$ref": "#/components/schemas/ProblemDocument"}
 _TOKEN = "token"
-ALWAYS = (400, 431, 500)
+ALWAYS = (400, 421, 431, 500)
 """Problems that any request can meet."""
 WORK = (403, 406, 408, 409, 413, 415, 422, 429, 501, 503)
 """Problems of a request that becomes a job, and of the job."""

@@ -30,6 +30,8 @@ KINDS: dict[str, Kind] = {
     "too-large": Kind(413, "The body is too large", "See /v1/limits."),
     "range-not-satisfiable": Kind(416, "The result does not reach that far", "Content-Range tells its size in bytes."),
     "unsupported-media-type": Kind(415, "The body is of a type that is not read", "Send JSON, or multipart with USD."),
+    "misdirected": Kind(421, "The service does not go by this name",
+                        "Ask by `localhost`, by the address it listens on, or by a name given with `--allow-host`."),
     "invalid-settings": Kind(422, "The settings are not valid", "`errors` names each field by a JSON pointer."),
     "stage-invalid": Kind(422, "The stage cannot be read", "Try `refract validate` on it."),
     "stage-refused": Kind(422, "The stage refers to something outside itself",

@@ -7,6 +7,7 @@ import contextlib
 import logging
 import socket
 import sys
+from dataclasses import replace
 from http import HTTPStatus
 from types import FrameType
 from typing import Any
@@ -32,9 +33,9 @@ def serve(settings: Settings, host: str, port: int) -> None:
     Raises:
         UsageError: the address cannot be used.
     """
-    app = create_app(settings)
+    app = create_app(replace(settings, host=host))
     config = uvicorn.Config(
-        app, host=host, port=port, http=_patient(settings.limits.header_seconds), ws="none", lifespan="on",
+        app, host=host, port=port, http=protocol(settings.limits.header_seconds), ws="none", lifespan="on",
         timeout_keep_alive=15, timeout_graceful_shutdown=settings.limits.drain_seconds, server_header=False,
         log_level="warning", access_log=False,
     )  # fmt: skip
@@ -59,7 +60,7 @@ class _Server(uvicorn.Server):
         super().handle_exit(sig, frame)
 
 
-def _patient(seconds: float) -> type[H11Protocol]:
+def protocol(seconds: float) -> type[H11Protocol]:
     """uvicorn's own protocol, which ends a connection that does not get to the end of a head in time, and answers what
     is not HTTP with a problem document too."""
 
@@ -88,7 +89,8 @@ def _patient(seconds: float) -> type[H11Protocol]:
             if begun:
                 self.transport.close()
                 return
-            headers = [*answer.raw_headers, *GUARDS, (b"connection", b"close")]
+            headers = [*answer.raw_headers, *GUARDS, (b"cross-origin-resource-policy", b"same-origin"),
+                       (b"connection", b"close")]  # fmt: skip
             reason = HTTPStatus(answer.status_code).phrase.encode()
             with contextlib.suppress(h11.LocalProtocolError):  # the answer to a HEAD has no body
                 self._write(h11.Response(status_code=answer.status_code, headers=headers, reason=reason))

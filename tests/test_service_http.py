@@ -18,7 +18,7 @@ from refract_core.images.pictures import read_texture
 
 pytestmark = pytest.mark.slow
 GOOD = ROOT / "usd_samples" / "good"
-JSON = b"POST /v1/render HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+JSON = b"POST /v1/render HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
 SOON = 30.0
 """[s] What ends within it ended because it was stopped: `LONG` takes longer by itself."""
 
@@ -163,7 +163,7 @@ def test_cancel_kills_the_process(client: httpx.Client, server: Server) -> None:
 def test_who_leaves_cancels_what_only_they_waited_for(client: httpx.Client, server: Server) -> None:
     with server.connect() as connection:
         body = json.dumps({**LONG, "exposure": 0.5}).encode()
-        head = "POST /v1/render HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+        head = "POST /v1/render HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
         connection.sendall(f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body)
         until(lambda: server.metric("refract_jobs_running") == 1.0)
     until(lambda: server.metric("refract_jobs_running") == 0.0, SOON)
@@ -176,7 +176,7 @@ def test_a_full_queue_refuses_before_it_reads(client: httpx.Client, server: Serv
     ]
     assert [job.status_code for job in jobs] == [202, 202]
     with server.connect() as connection:
-        connection.sendall(b"POST /v1/render HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+        connection.sendall(b"POST /v1/render HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
                            b"Content-Length: 1000\r\n\r\n{")  # fmt: skip
         answer = "".join(iter(lambda: connection.recv(4096).decode(), ""))
     assert " 429 " in answer.splitlines()[0]
@@ -211,9 +211,9 @@ def test_the_death_of_all_workers_is_survived(client: httpx.Client, server: Serv
     [
         (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03 no HTTP\r\n\r\n", 400),
         (b"GET /livez HTTP/1.1\r\n\r\n", 400),
-        (b"GET /livez HTTP/1.1\r\nHost: x\r\nno colon\r\n\r\n", 400),
-        (b"GET /livez HTTP/1.1\r\nHost: x\r\nX: " + b"a" * 500_000 + b"\r\n\r\n", 431),
-        (b"GET /" + b"a" * 500_000 + b" HTTP/1.1\r\nHost: x\r\n\r\n", 431),
+        (b"GET /livez HTTP/1.1\r\nHost: localhost\r\nno colon\r\n\r\n", 400),
+        (b"GET /livez HTTP/1.1\r\nHost: localhost\r\nX: " + b"a" * 500_000 + b"\r\n\r\n", 431),
+        (b"GET /" + b"a" * 500_000 + b" HTTP/1.1\r\nHost: localhost\r\n\r\n", 431),
         (JSON + b"Content-Length: -5\r\n\r\n", 400),
         (JSON + b"Transfer-Encoding: gzip\r\n\r\n", 501),
         (JSON + b"Transfer-Encoding: chunked\r\n\r\nZZ\r\nabc\r\n", 400),

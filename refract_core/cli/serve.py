@@ -13,6 +13,23 @@ from .app import app, outcome
 
 Host = Annotated[str, typer.Option(help="Address to listen on. The default takes requests of this machine only.")]
 Port = Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 takes a free one and prints it.")]
+AllowHost = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME",
+        envvar="REFRACT_ALLOW_HOST",
+        help="A name that requests may call the service by, beside localhost and --host; may be repeated. Others are "
+        "refused with 421, or any page could have its own name lead here.",
+    ),
+]
+AllowOrigin = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="ORIGIN",
+        envvar="REFRACT_ALLOW_ORIGIN",
+        help="Another site whose pages may use the service, such as https://shop.example.org; may be repeated.",
+    ),
+]
 StageRoot = Annotated[
     str,
     typer.Option(
@@ -73,6 +90,8 @@ _SENT = 32
 def serve(
     host: Host = "127.0.0.1",
     port: Port = 8000,
+    allow_host: AllowHost = None,
+    allow_origin: AllowOrigin = None,
     stage_root: StageRoot = "",
     workers: Workers = None,
     queue: Queue = 16,
@@ -99,6 +118,7 @@ def serve(
 
         settings = Settings(
             stage_root=stage_root, data=data, executor=executor, queue=queue, tokens=_tokens(token_file), limits=chosen,
+            allow_hosts=tuple(allow_host or ()), allow_origins=tuple(allow_origin or ()),
             workers=workers if workers is not None else _SENT if executor else os.cpu_count() or 1,
         )  # fmt: skip
         run(settings, host, port)
