@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 import logging
 import shutil
 from collections.abc import AsyncIterator, Mapping
@@ -17,6 +18,7 @@ from fastapi.responses import HTMLResponse, JSONResponse
 from fastapi.staticfiles import StaticFiles
 from starlette.exceptions import HTTPException as StarletteHTTPException
 from starlette.routing import Match
+from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from refract_core.errors import UsageError
 from refract_core.verbs.executors import scheduler_of
@@ -56,6 +58,8 @@ class Settings:
     """Names that it answers to, beside `localhost` and `host`."""
     allow_origins: tuple[str, ...] = ()
     """Other sites whose pages may use it, such as `https://shop.example.org`."""
+    proxies: tuple[str, ...] = ()
+    """Addresses of reverse proxies, or networks of them, which are believed in `X-Forwarded-For`."""
     tokens: tuple[str, ...] = ()
     """Bearer tokens, one of which every request under /v1 must bring; none means open to all."""
     limits: Limits = field(default_factory=Limits)
@@ -70,6 +74,11 @@ class Settings:
         if self.stage_root and not Path(self.stage_root).is_dir():
             raise UsageError(f"--stage-root {self.stage_root}: there is no such folder")
         door(self.host, self.allow_hosts, self.allow_origins)
+        for proxy in self.proxies:
+            try:
+                ipaddress.ip_network(proxy)
+            except ValueError as error:
+                raise UsageError(f"--proxy {proxy}: write an address, such as 127.0.0.1, or 10.0.0.0/8") from error
         if any(len(token) < 8 for token in self.tokens):
             raise UsageError("a bearer token is shorter than 8 characters; take a long random one")
 
@@ -110,6 +119,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.jobs, app.state.settings, app.state.metrics = jobs, settings, metrics
     entry = door(settings.host, settings.allow_hosts, settings.allow_origins)
     app.add_middleware(Edge, door=entry, tokens=settings.tokens, metrics=metrics)
+    if settings.proxies:
+        app.add_middleware(ProxyHeadersMiddleware, trusted_hosts=list(settings.proxies))
     _add_handlers(app)
     _add_pages(app, settings, metrics)
     app.include_router(routes.router)

@@ -16,6 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from .hosts import Door
 from .metrics import Metrics
 from .problems import MEDIA_TYPE, Problem, of_status, respond
+from .shares import Client, address_of
 
 _LINGER = 2.0
 """[s] A client that is still sending when it is refused would lose the answer if the connection closed at once."""
@@ -41,7 +42,9 @@ class Edge:
         unread = headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
         expects = headers.get("expect", "").lower() == "100-continue"
         identifier = secrets.token_hex(8)
-        scope.setdefault("state", {})["request_id"] = identifier
+        state = scope.setdefault("state", {})
+        state["request_id"] = identifier
+        state["client"] = Client(address_of((scope.get("client") or ("",))[0]))
         inner, answered = _for_the_app(scope), False
         others = self.door.headers(scope["path"], headers.get("origin", ""))
 

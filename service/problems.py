@@ -44,6 +44,9 @@ KINDS: dict[str, Kind] = {
                           "The stage is damaged, or it has found a fault of this program: whoever runs the service has "
                           "the reason in its log, under the job's id. Nothing else was affected."),
     "queue-full": Kind(429, "Too many jobs are waiting", "Try again after the time in Retry-After."),
+    "share-spent": Kind(429, "One client may not have more at once",
+                        "Let what is under way end, or try again after the time in Retry-After; `share` of /v1/limits "
+                        "says how much."),
     "head-too-large": Kind(431, "The head of the request is too large", "Send fewer or shorter headers."),
     "internal": Kind(500, "Something went wrong in the service", "Tell whoever runs it the request's id."),
     "transfer-coding": Kind(501, "The transfer coding is not known", "Send Content-Length, or chunks."),

@@ -35,9 +35,9 @@ def serve(settings: Settings, host: str, port: int) -> None:
     """
     app = create_app(replace(settings, host=host))
     config = uvicorn.Config(
-        app, host=host, port=port, http=protocol(settings.limits.header_seconds), ws="none", lifespan="on",
+        app, host=host, port=port, http=_patient(settings.limits.header_seconds), ws="none", lifespan="on",
         timeout_keep_alive=15, timeout_graceful_shutdown=settings.limits.drain_seconds, server_header=False,
-        log_level="warning", access_log=False,
+        log_level="warning", access_log=False, proxy_headers=False,  # `create_app` has those
     )  # fmt: skip
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -60,7 +60,7 @@ class _Server(uvicorn.Server):
         super().handle_exit(sig, frame)
 
 
-def protocol(seconds: float) -> type[H11Protocol]:
+def _patient(seconds: float) -> type[H11Protocol]:
     """uvicorn's own protocol, which ends a connection that does not get to the end of a head in time, and answers what
     is not HTTP with a problem document too."""
 

@@ -17,7 +17,6 @@ from service_server import PATIENCE, ROOT, InProcess, until
 from refract_core.errors import UsageError
 from service.app import Settings, create_app
 from service.hosts import door
-from service.serve import protocol
 
 GOOD = ROOT / "usd_samples" / "good"
 SHOP = "https://shop.example.org"
@@ -30,10 +29,10 @@ def app_of(folder: Path, **settings: Any) -> InProcess:
 
 @contextmanager
 def listening(folder: Path, **settings: Any) -> Iterator[tuple[str, int]]:
-    """The app behind the real protocol on a real socket, in a thread; no worker is started."""
+    """The app on a real socket, in a thread; no worker is started."""
     chosen = Settings(stage_root=str(GOOD), data=str(folder / "data"), **settings)
-    config = uvicorn.Config(create_app(chosen), http=protocol(chosen.limits.header_seconds), ws="none", lifespan="off",
-                            log_level="error", server_header=False)  # fmt: skip
+    config = uvicorn.Config(create_app(chosen), http="h11", ws="none", lifespan="off", log_level="error",
+                            proxy_headers=False, server_header=False)  # fmt: skip
     with socket.create_server(("127.0.0.1", 0)) as listener:
         server = uvicorn.Server(config)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
@@ -98,7 +97,7 @@ def test_a_page_whose_name_was_bound_anew_reads_nothing(tmp_path: Path) -> None:
     {"allow_hosts": ("a:80",)}, {"allow_hosts": ("http://a",)}, {"allow_hosts": ("",)}, {"allow_hosts": ("*",)},
     {"allow_origins": ("*",)}, {"allow_origins": ("null",)}, {"allow_origins": ("shop.example.org",)},
     {"allow_origins": ("https://a/b",)}, {"allow_origins": ("https://a?b",)}, {"allow_origins": ("ftp://a",)},
-    {"allow_origins": ("https://u@a",)}, {"allow_origins": ("https://a:x",)},
+    {"proxies": ("*",)}, {"proxies": ("localhost",)}, {"allow_origins": ("https://u@a",)}, {"allow_origins": ("https://a:x",)},
 ])  # fmt: skip
 def test_names_and_sites_are_checked_at_the_start(wrong: dict[str, Any]) -> None:
     with pytest.raises(UsageError):

@@ -26,7 +26,8 @@ SOON = 30.0
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     data = tmp_path_factory.mktemp("service") / "data"
-    with running(data, "--stage-root", str(GOOD), "--workers", "1", "--queue", "1", *PATIENT) as server:
+    words = ("--stage-root", str(GOOD), "--workers", "1", "--queue", "1", *PATIENT, "--limit", "share=100")
+    with running(data, *words) as server:
         yield server
 
 
@@ -169,19 +170,18 @@ def test_who_leaves_cancels_what_only_they_waited_for(client: httpx.Client, serv
     until(lambda: server.metric("refract_jobs_running") == 0.0, SOON)
 
 
-def test_a_full_queue_refuses_before_it_reads(client: httpx.Client, server: Server) -> None:
+def test_a_full_queue_refuses_new_jobs_and_gives_what_there_is(client: httpx.Client, server: Server) -> None:
+    picture = post(client, exposure=-3.0)
     jobs = [
         client.post("/v1/render", json={**LONG, "exposure": float(stop)}, headers={"Prefer": "respond-async"})
         for stop in (3, 4)
     ]
     assert [job.status_code for job in jobs] == [202, 202]
-    with server.connect() as connection:
-        connection.sendall(b"POST /v1/render HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
-                           b"Content-Length: 1000\r\n\r\n{")  # fmt: skip
-        answer = "".join(iter(lambda: connection.recv(4096).decode(), ""))
-    assert " 429 " in answer.splitlines()[0]
-    assert "retry-after: " in answer.lower()
-    assert "/problems/queue-full" in answer
+    refused = post(client, exposure=-4.0)
+    assert (refused.status_code, refused.json()["type"]) == (429, "/problems/queue-full")
+    assert int(refused.headers["retry-after"]) >= 1
+    again = post(client, exposure=-3.0)
+    assert (again.status_code, again.headers["etag"], again.content) == (200, picture.headers["etag"], picture.content)
     for job in jobs:
         client.delete(job.headers["location"])
 

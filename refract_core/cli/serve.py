@@ -30,6 +30,15 @@ AllowOrigin = Annotated[
         help="Another site whose pages may use the service, such as https://shop.example.org; may be repeated.",
     ),
 ]
+Proxy = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="ADDRESS",
+        envvar="REFRACT_PROXY",
+        help="A reverse proxy, or a network of them, whose X-Forwarded-For is believed; may be repeated. Without it, "
+        "all its clients count as one, and share what one may have.",
+    ),
+]
 StageRoot = Annotated[
     str,
     typer.Option(
@@ -92,6 +101,7 @@ def serve(
     port: Port = 8000,
     allow_host: AllowHost = None,
     allow_origin: AllowOrigin = None,
+    proxy: Proxy = None,
     stage_root: StageRoot = "",
     workers: Workers = None,
     queue: Queue = 16,
@@ -119,6 +129,7 @@ def serve(
         settings = Settings(
             stage_root=stage_root, data=data, executor=executor, queue=queue, tokens=_tokens(token_file), limits=chosen,
             allow_hosts=tuple(allow_host or ()), allow_origins=tuple(allow_origin or ()),
+            proxies=tuple(proxy or ()),
             workers=workers if workers is not None else _SENT if executor else os.cpu_count() or 1,
         )  # fmt: skip
         run(settings, host, port)
