@@ -33,6 +33,7 @@ from .metrics import CONTENT_TYPE, Metrics
 from .pool import Nursery, Source
 from .problems import BY_STATUS, KINDS, MEDIA_TYPE, Problem, respond
 from .store import Store
+from .tokens import tokens_of
 
 log = logging.getLogger("refract.service")
 _STATIC = Path(__file__).parent / "static"
@@ -61,7 +62,7 @@ class Settings:
     proxies: tuple[str, ...] = ()
     """Addresses of reverse proxies, or networks of them, which are believed in `X-Forwarded-For`."""
     tokens: tuple[str, ...] = ()
-    """Bearer tokens, one of which every request under /v1 must bring; none means open to all."""
+    """Lines of a token file; every request under /v1 must bring one of the tokens. None means open to all."""
     limits: Limits = field(default_factory=Limits)
 
     def __post_init__(self) -> None:
@@ -79,8 +80,7 @@ class Settings:
                 ipaddress.ip_network(proxy)
             except ValueError as error:
                 raise UsageError(f"--proxy {proxy}: write an address, such as 127.0.0.1, or 10.0.0.0/8") from error
-        if any(len(token) < 8 for token in self.tokens):
-            raise UsageError("a bearer token is shorter than 8 characters; take a long random one")
+        tokens_of(self.tokens)
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
@@ -118,7 +118,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )  # fmt: skip
     app.state.jobs, app.state.settings, app.state.metrics = jobs, settings, metrics
     entry = door(settings.host, settings.allow_hosts, settings.allow_origins)
-    app.add_middleware(Edge, door=entry, tokens=settings.tokens, metrics=metrics)
+    app.add_middleware(Edge, door=entry, tokens=tokens_of(settings.tokens), metrics=metrics)
     if settings.proxies:
         app.add_middleware(ProxyHeadersMiddleware, trusted_hosts=list(settings.proxies))
     _add_handlers(app)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import hmac
 import re
 import secrets
 import time
@@ -17,6 +16,7 @@ from .hosts import Door
 from .metrics import Metrics
 from .problems import MEDIA_TYPE, Problem, of_status, respond
 from .shares import Client, address_of
+from .tokens import Token, needed, token_in
 
 _LINGER = 2.0
 """[s] A client that is still sending when it is refused would lose the answer if the connection closed at once."""
@@ -30,9 +30,8 @@ GUARDS = ((b"x-content-type-options", b"nosniff"), (b"referrer-policy", b"no-ref
 class Edge:
     """ASGI middleware."""
 
-    def __init__(self, app: ASGIApp, *, door: Door, tokens: Sequence[str], metrics: Metrics) -> None:
-        self.app, self.door, self.metrics = app, door, metrics
-        self.tokens = [token.encode() for token in tokens]
+    def __init__(self, app: ASGIApp, *, door: Door, tokens: Sequence[Token], metrics: Metrics) -> None:
+        self.app, self.door, self.tokens, self.metrics = app, door, tokens, metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -94,23 +93,22 @@ class Edge:
         return respond(problem) if problem else None
 
     def _refusal(self, scope: Scope, headers: Headers) -> Problem | None:
-        path = scope["path"]
-        if self.tokens and guarded(path):
-            scheme, _, given = headers.get("authorization", "").partition(" ")
-            matches = [hmac.compare_digest(given.strip().encode(), token) for token in self.tokens]
-            if scheme.lower() != "bearer" or not any(matches):
+        wanted = needed(scope["method"], scope["path"])
+        if self.tokens and wanted:
+            token = token_in(headers.get("authorization", ""), self.tokens)
+            if token is None:
                 return Problem("unauthorized", "this service asks for a bearer token")
+            state = scope["state"]
+            state["client"] = state["client"]._replace(owner=token.owner)
+            if wanted not in token.scopes:
+                lacks = f'Bearer error="insufficient_scope", scope="{wanted}"'
+                return Problem("forbidden", f"the token has no scope {wanted}", headers={"WWW-Authenticate": lacks})
         origin = headers.get("origin")
         if scope["method"] not in ("GET", "HEAD", "OPTIONS") and origin and not self.door.lets_in(
             origin, headers.get("host", "")
         ):  # fmt: skip
             return Problem("cross-origin", "a page of another site may not ask for work here")
         return None
-
-
-def guarded(path: str) -> bool:
-    """Where a token is asked for, if there are any. The page and the documentation are for everybody."""
-    return path == "/metrics" or path.startswith("/v1/")
 
 
 def _misled(headers: Headers, door: Door) -> Problem | None:

@@ -118,7 +118,9 @@ class Jobs:
         Raises:
             Problem: there is no place for another job, or not for this client.
         """
-        wish = json.dumps([kind, engine(), digest, settings], sort_keys=True, allow_nan=False)
+        # Each owner has jobs of its own: that somebody else has asked for the same is nobody's business.
+        owner = [client.owner] if client.owner else []
+        wish = json.dumps([kind, engine(), digest, settings, *owner], sort_keys=True, allow_nan=False)
         identifier = hashlib.sha256(wish.encode()).hexdigest()
         known = self.records.get(identifier)
         if known and known.status in ("queued", "running", "done"):
@@ -126,7 +128,7 @@ class Jobs:
             return known
         self.shares.check(client)
         self.store.remove(identifier)
-        record = Record(identifier, kind, settings, stage, upload is not None)
+        record = Record(identifier, kind, settings, stage, upload is not None, owner=client.owner)
         self.store.save(record)
         if upload:
             os.replace(upload, self.store.folder(identifier) / stage)

@@ -20,6 +20,7 @@ class Kind(NamedTuple):
 KINDS: dict[str, Kind] = {
     "bad-request": Kind(400, "The request cannot be read", "Send the body the documentation describes."),
     "unauthorized": Kind(401, "A token is needed", "Send `Authorization: Bearer TOKEN`."),
+    "forbidden": Kind(403, "The token may not do this", "Use one with the scope that detail names."),
     "cross-origin": Kind(403, "The request comes from another site", "Use the service's own page, or a program."),
     "not-found": Kind(404, "There is nothing here", "Check the path; jobs and results are removed after some time."),
     "method-not-allowed": Kind(405, "The method is not allowed here", "Use a method that the Allow header names."),

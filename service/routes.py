@@ -178,7 +178,7 @@ async def _done_or_gone(request: Request, jobs: Jobs, record: Record) -> bool:
 
 def _known(request: Request, identifier: str) -> Record:
     record = _jobs(request).records.get(identifier)
-    if record is None:
+    if record is None or record.owner != _client(request).owner:
         raise Problem("not-found", "there is no such job; it may have been removed")
     return record
 

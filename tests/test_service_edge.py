@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import shutil
 import socket
 import threading
 from collections.abc import Iterator
@@ -157,6 +159,103 @@ def test_a_browser_that_asks_first_is_answered_before_a_token_is_asked_for(tmp_p
     assert {"Origin", "Access-Control-Request-Method"} <= {*answer.headers["vary"].split(", ")}
     refused = client.request("OPTIONS", "/v1/render", headers={**question, "Origin": THEIRS})
     assert "access-control-allow-origin" not in refused.headers
+
+
+# --- tokens
+
+
+def line_of(name: str, token: str, scopes: str) -> str:
+    return f"{name} sha256:{hashlib.sha256(token.encode()).hexdigest()} {scopes}"
+
+
+def bearer(token: str) -> dict[str, str]:
+    return {"Authorization": f"Bearer {token}"}
+
+
+TOKENS = (line_of("studio", "of-the-studio", "read,render"), line_of("studio", "of-its-wall", "read"),
+          line_of("press", "of-the-press", "render"), line_of("prometheus", "of-prometheus", "metrics"),
+          "a-token-for-all")  # fmt: skip
+MAY = {"of-the-studio": {"read", "render"}, "of-its-wall": {"read"}, "of-the-press": {"render"},
+       "of-prometheus": {"metrics"}, "a-token-for-all": {"read", "render", "metrics"}}  # fmt: skip
+
+
+@pytest.mark.parametrize("token", MAY)
+def test_a_token_may_do_what_its_scopes_say(tmp_path: Path, token: str) -> None:
+    client = app_of(tmp_path, tokens=TOKENS)
+    asked = {"read": ("GET", "/v1/stages"), "render": ("POST", "/v1/render"), "metrics": ("GET", "/metrics")}
+    for scope, (method, path) in asked.items():
+        answer = client.request(method, path, headers=bearer(token))
+        if scope in MAY[token]:
+            assert answer.status_code == (415 if method == "POST" else 200)
+            continue
+        assert (answer.status_code, answer.json()["type"]) == (403, "/problems/forbidden")
+        assert answer.headers["www-authenticate"] == f'Bearer error="insufficient_scope", scope="{scope}"'
+    assert client.request("DELETE", "/v1/jobs/x", headers=bearer(token)).status_code == (
+        404 if "render" in MAY[token] else 403
+    )
+    assert client.get("/livez").status_code == client.get("/").status_code == 200
+
+
+@pytest.mark.parametrize("given", ["", "Bearer", "Bearer ", "Bearer wrong", "Basic of-the-studio", "of-the-studio",
+                                   "Bearer of-the-studi", "Bearer of-the-studio2", "Bearer \xff\xfe"])  # fmt: skip
+def test_a_wrong_token_is_none(tmp_path: Path, given: str) -> None:
+    client = app_of(tmp_path, tokens=TOKENS)
+    answer = client.get("/v1/stages", headers={"Authorization": given.encode("latin-1")})
+    assert (answer.status_code, answer.headers["www-authenticate"]) == (401, "Bearer")
+    hashed = TOKENS[0].split()[1].removeprefix("sha256:")
+    assert client.get("/v1/stages", headers=bearer(hashed)).status_code == 401  # a stolen file opens nothing
+
+
+@pytest.mark.parametrize("lines", [
+    ("studio sha256:12 read",), ("studio sha256:" + "0" * 64,), ("studio " + "0" * 64 + " read",), ("short",),
+    ("stu/dio sha256:" + "0" * 64 + " read",), ("studio sha256:" + "0" * 64 + " read,dance",), ("a b c d",),
+    ("studio sha256:" + "0" * 64 + " ,",), (line_of("a", "of-the-studio", "read"), "of-the-studio"),
+])  # fmt: skip
+def test_a_token_file_is_checked_and_never_quoted(lines: tuple[str, ...]) -> None:
+    with pytest.raises(UsageError) as caught:
+        Settings(tokens=lines)
+    assert "0000" not in str(caught.value)
+    assert "of-the-studio" not in str(caught.value)
+
+
+def test_a_job_is_its_owners_alone(tmp_path: Path) -> None:
+    """For another token it is not there, and neither is it for one who asks for the very same."""
+    client = app_of(tmp_path, tokens=TOKENS, workers=1, queue=9)
+    wish = {"json": {"stage": "marble.usda"}}
+
+    def ask(token: str) -> str:
+        headers = {**bearer(token), "Prefer": "respond-async"}
+        answer = client.post("/v1/render", headers=headers, **wish)
+        assert answer.status_code == 202
+        return answer.headers["location"]
+
+    where = ask("of-the-studio")
+    assert ask("of-the-studio") == where
+    assert len({where, ask("of-the-press"), ask("a-token-for-all")}) == 3
+    parts = ("", "/image", "/events", "/report", "/file", "/aovs/Z.png")
+    for part in parts:
+        theirs = client.get(where + part, headers=bearer("a-token-for-all"))
+        nothing = client.get(f"/v1/jobs/{'0' * 64}{part}", headers=bearer("a-token-for-all"))
+        assert (theirs.status_code, theirs.json()) == (404, nothing.json())
+    assert client.request("DELETE", where, headers=bearer("a-token-for-all")).status_code == 404
+    assert client.request("DELETE", where, headers=bearer("of-the-press")).status_code == 404
+    assert client.get(where, headers=bearer("of-its-wall")).json()["status"] == "queued"
+    assert client.request("DELETE", where, headers=bearer("of-the-studio")).json()["status"] == "cancelled"
+
+
+def _copied(folder: Path, name: str) -> Path:
+    shutil.copytree(folder / "data", folder / name / "data")
+    return folder / name
+
+
+def test_an_owner_is_kept_over_a_restart(tmp_path: Path) -> None:
+    headers = {**bearer("of-the-studio"), "Prefer": "respond-async"}
+    first = app_of(tmp_path, tokens=TOKENS)
+    where = first.post("/v1/render", headers=headers, json={"stage": "marble.usda"}).headers["location"]
+    again, later = (app_of(_copied(tmp_path, name), **how) for name, how in (("a", {"tokens": TOKENS}), ("b", {})))
+    assert again.get(where, headers=bearer("of-its-wall")).json()["status"] == "failed"  # interrupted
+    assert again.get(where, headers=bearer("a-token-for-all")).status_code == 404
+    assert later.get(where).status_code == 404  # nor is it everybody's once no token is asked for
 
 
 # --- length told twice

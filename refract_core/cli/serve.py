@@ -76,7 +76,8 @@ TokenFile = Annotated[
     typer.Option(
         metavar="FILE",
         envvar="REFRACT_TOKEN_FILE",
-        help="Bearer tokens, one a line, one of which each request must bring. Without it, everybody may come.",
+        help="Bearer tokens, one a line, one of which each request must bring: a token alone, or NAME sha256:HEX "
+        "SCOPES. Without it, everybody may come.",
     ),
 ]
 Limit = Annotated[
@@ -155,7 +156,7 @@ def _numbers(given: list[str]) -> dict[str, int | None]:
 
 
 def _tokens(path: str) -> tuple[str, ...]:
-    """The tokens of a file, one a line; lines that begin with # are for people. Raises UsageError."""
+    """Lines of a file of tokens; those that begin with # are for people. Raises UsageError."""
     if not path:
         return ()
     try:
