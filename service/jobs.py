@@ -26,6 +26,7 @@ from .limits import Limits
 from .metrics import Metrics
 from .pool import Source, Worker
 from .problems import KINDS, Problem
+from .shares import NOBODY, Client, Shares
 from .shortage import problem_of
 from .slots import Ready, Slots
 from .store import Record, Store, now
@@ -66,10 +67,9 @@ class Jobs:
         self.workers, self.places, self.stage_root = workers, workers + queue, stage_root
         self.records = store.load_all()
         self.draining = False
-        self.streams = 0
-        self._held = 0
+        self.shares = Shares(limits, workers, queue)
         self._active: set[str] = set()
-        self._line: asyncio.Queue[str] = asyncio.Queue()
+        self._line = self.shares.line
         self._given: dict[int, Worker] = {}
         """By `id` of the record: one that was cancelled and asked for again has two for a moment."""
         self._running: set[int] = set()
@@ -77,11 +77,9 @@ class Jobs:
         self._kept: set[str] = set()
         self._news: dict[str, asyncio.Event] = {}
         self._tasks: list[asyncio.Task[None]] = []
-        self._usual = 1.0
         self._hidden = {*own_folders(), str(store.jobs.parent), *([str(stage_root)] if stage_root else ())}
         self.slots = Slots(workers, self._one, metrics)
         self._unsaved: set[str] = set()
-        """Jobs whose end could not be written down yet."""
 
     # --- life -------------------------------------------------------------------------------------------------------
 
@@ -135,35 +133,36 @@ class Jobs:
     # --- in ---------------------------------------------------------------------------------------------------------
 
     @contextlib.contextmanager
-    def place(self) -> Iterator[None]:
-        """Hold a place in the queue while a request's body arrives. Raises Problem where there is none."""
+    def arriving(self, client: Client) -> Iterator[None]:
+        """While a request's body arrives, which takes no place in the queue yet. Raises Problem."""
         if self.draining:
             raise Problem("unavailable", "the service is about to stop", headers={"Retry-After": "10"})
-        if len(self._active) + self._held >= self.places:
-            wait = max(1, min(60, math.ceil(self._usual * len(self._active) / self.workers)))
-            text = f"{len(self._active)} jobs are waiting or running"
-            raise Problem("queue-full", text, headers={"Retry-After": str(wait)})
-        self._held += 1
-        try:
+        with self.shares.bodies.one(client, "bodies that may arrive"):
             yield
-        finally:
-            self._held -= 1
 
-    def submit(self, kind: str, settings: dict[str, Any], digest: str, stage: str, upload: Path | None) -> Record:
-        """The job of a request: a new one, or the one that is already there.
+    def submit(
+        self, kind: str, settings: dict[str, Any], digest: str, stage: str, upload: Path | None,
+        client: Client = NOBODY,
+    ) -> Record:  # fmt: skip
+        """The job of a request: a new one, or the one that is already there, which takes no further place.
 
         Args:
             digest: of all the stage is made of.
             stage: path under the stage root, or the name the uploaded file shall have.
             upload: the uploaded file, which is moved; None for a stage of ours.
+
+        Raises:
+            Problem: there is no place for another job, or not for this client.
         """
-        identifier = _identity(kind, digest, settings)
+        owner = [client.owner] if client.owner else []
+        identifier = _identity(kind, digest, {**settings, 'owner': owner} if owner else settings)
         known = self.records.get(identifier)
         if known and known.status in ("queued", "running", "done"):
             self.metrics.cached.inc()
             return known
+        self.shares.check(client)
         self.store.remove(identifier)
-        record = Record(identifier, kind, settings, stage, upload is not None)
+        record = Record(identifier, kind, settings, stage, upload is not None, owner=client.owner)
         try:
             self.store.save(record)
             if upload:
@@ -175,7 +174,7 @@ class Jobs:
         self.records[identifier] = record
         self._active.add(identifier)
         self._count()
-        self._line.put_nowait(identifier)
+        self.shares.enter(record, client)
         return record
 
     # --- listening --------------------------------------------------------------------------------------------------
@@ -291,6 +290,7 @@ class Jobs:
         record.status, record.started, record.stage_of_work = "running", now(), "starting"
         self.store.save(record)
         self._running.add(id(record))
+        self.shares.began(record)
         self._count()
         self._tell(record)
         problem: Problem | None = None
@@ -306,7 +306,6 @@ class Jobs:
         if record.ended:
             return
         seconds = time.monotonic() - started
-        self._usual = 0.8 * self._usual + 0.2 * seconds
         self.metrics.worked.labels(record.kind).observe(seconds)
         if problem is None:
             self.store.take_results(work, record)
@@ -371,6 +370,7 @@ class Jobs:
         if status == "done":
             record.fraction = 1.0
         self._active.discard(record.id)
+        self.shares.ended(record)
         self._count()
         self.metrics.jobs.labels(record.kind, problem.slug if problem else status).inc()
         self._unsaved.add(record.id)

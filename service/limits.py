@@ -26,6 +26,7 @@ class Limits:
 
     body_bytes: int = _limit(64 << 20, "bytes", "body of one request")
     body_seconds: int = _limit(30, "s", "time for a request's body to arrive")
+    bodies: int = _limit(32, "bodies", "bodies of requests that arrive at once")
     header_seconds: int = _limit(10, "s", "time for a request's head to arrive")
     connections: int = _limit(1000, "connections", "open at once; fewer where the process may open too few files")
     settings_bytes: int = _limit(256 << 10, "bytes", "settings of one request, as JSON")
@@ -33,6 +34,7 @@ class Limits:
     layers: int = _limit(256, "files", "layers that one stage is composed of")
     pixels: int = _limit(1 << 22, "pixels", "width times height of a picture")
     samples: int = _limit(64, "per pixel", "samples of a pixel")
+    side: int = _limit(16384, "pixels", "width, and height, of a picture")
     pixel_samples: int = _limit(1 << 27, "samples", "width times height times samples")
     aovs: int = _limit(16, "planes", "AOVs of one request")
     triangles: int = _limit(20_000_000, "triangles", "triangles of a stage, instances counted")
@@ -45,6 +47,7 @@ class Limits:
     open_files: int = _limit(256, "files", "files open at once in a job")
     warnings: int = _limit(200, "entries", "warnings kept of one job")
     event_streams: int = _limit(100, "streams", "clients that listen to events at once")
+    share: int = _limit(50, "per cent", "bodies, waiting jobs and event streams that one client may have; 100 is all")
     retention_seconds: int = _limit(24 * 3600, "s", "time a finished job and its results are kept")
     retention_bytes: int = _limit(2 << 30, "bytes", "results kept in all; the oldest go first")
     drain_seconds: int = _limit(20, "s", "time running jobs get to finish when the service is asked to stop")

@@ -52,6 +52,8 @@ class Record:
     warnings: list[dict[str, str]] = field(default_factory=list)
     result: dict[str, Any] = field(default_factory=dict)
     problem: dict[str, Any] | None = None
+    owner: str = ""
+    """Of the token that asked for it; '' where none was asked for."""
 
     @property
     def ended(self) -> bool:

@@ -142,7 +142,8 @@ def _check_scene(scene: Scene, limits: Mapping[str, int]) -> None:
 
 
 def _check_size(width: int, height: int, samples: int, limits: Mapping[str, int]) -> None:
-    asked = {"pixels": width * height, "samples": samples, "pixel_samples": width * height * samples}
+    asked = {"side": max(width, height), "pixels": width * height, "samples": samples,
+             "pixel_samples": width * height * samples}  # fmt: skip
     for name, value in asked.items():
         if value > limits[name]:
             what = f"{width} x {height} pixels with {samples} samples"

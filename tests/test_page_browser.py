@@ -32,7 +32,8 @@ CONTROLS = r"^\s*- (button|textbox|combobox|slider|spinbutton|checkbox|radio|pro
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     with playwright.sync_playwright() as driver:
-        opened = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"], timeout=PATIENCE)
+        words = ["--no-sandbox", "--host-resolver-rules=MAP evil.test 127.0.0.1"]
+        opened = driver.chromium.launch(executable_path=CHROMIUM, args=words, timeout=PATIENCE)
         yield opened
         opened.close()
 
@@ -345,4 +346,17 @@ def test_against_the_real_service(browser: Any, real_url: str) -> None:
     playwright.expect(opened.locator("#legend")).to_contain_text("1.24 m")
     opened.get_by_label("Samples per pixel").fill("4096")
     playwright.expect(opened.get_by_role("alert")).to_contain_text("limit")
+    opened.close()
+
+
+def test_a_page_of_a_name_bound_anew_is_shown_nothing(browser: Any, real_url: str) -> None:
+    """DNS rebinding: this browser is told that evil.test is this machine."""
+    port = real_url.rstrip("/").rpartition(":")[2]
+    opened = browser.new_page()
+    opened.set_default_timeout(PATIENCE)
+    answer = opened.goto(f"http://evil.test:{port}/v1/stages")
+    assert (answer.status, "marble" in answer.text()) == (421, False)
+    asked = opened.evaluate("async () => { const a = await fetch('/v1/stages'); return [a.status, await a.text()] }")
+    assert (asked[0], "marble" in asked[1]) == (421, False)
+    assert "marble.usda" in opened.goto(f"{real_url}v1/stages").text()
     opened.close()

@@ -13,6 +13,32 @@ from .app import app, outcome
 
 Host = Annotated[str, typer.Option(help="Address to listen on. The default takes requests of this machine only.")]
 Port = Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 takes a free one and prints it.")]
+AllowHost = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME",
+        envvar="REFRACT_ALLOW_HOST",
+        help="A name that requests may call the service by, beside localhost and --host; may be repeated. Others are "
+        "refused with 421, or any page could have its own name lead here.",
+    ),
+]
+AllowOrigin = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="ORIGIN",
+        envvar="REFRACT_ALLOW_ORIGIN",
+        help="Another site whose pages may use the service, such as https://shop.example.org; may be repeated.",
+    ),
+]
+Proxy = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="ADDRESS",
+        envvar="REFRACT_PROXY",
+        help="A reverse proxy, or a network of them, whose X-Forwarded-For is believed; may be repeated. Without it, "
+        "all its clients count as one, and share what one may have.",
+    ),
+]
 StageRoot = Annotated[
     str,
     typer.Option(
@@ -50,7 +76,8 @@ TokenFile = Annotated[
     typer.Option(
         metavar="FILE",
         envvar="REFRACT_TOKEN_FILE",
-        help="Bearer tokens, one a line, one of which each request must bring. Without it, everybody may come.",
+        help="Bearer tokens, one a line, one of which each request must bring: a token alone, or NAME sha256:HEX "
+        "SCOPES. Without it, everybody may come.",
     ),
 ]
 Limit = Annotated[
@@ -82,6 +109,9 @@ _SENT = 32
 def serve(
     host: Host = "127.0.0.1",
     port: Port = 8000,
+    allow_host: AllowHost = None,
+    allow_origin: AllowOrigin = None,
+    proxy: Proxy = None,
     stage_root: StageRoot = "",
     workers: Workers = None,
     queue: Queue = 16,
@@ -112,6 +142,8 @@ def serve(
             raise UsageError(f"--log {log}: choose from {', '.join(KINDS)}")
         settings = Settings(
             stage_root=stage_root, data=data, executor=executor, queue=queue, tokens=_tokens(token_file), limits=chosen,
+            allow_hosts=tuple(allow_host or ()), allow_origins=tuple(allow_origin or ()),
+            proxies=tuple(proxy or ()),
             workers=workers if workers is not None else _SENT if executor else os.cpu_count() or 1,
         )  # fmt: skip
         run(settings, host, port, log)
@@ -137,7 +169,7 @@ def _numbers(given: list[str]) -> dict[str, int | None]:
 
 
 def _tokens(path: str) -> tuple[str, ...]:
-    """The tokens of a file, one a line; lines that begin with # are for people. Raises UsageError."""
+    """Lines of a file of tokens; those that begin with # are for people. Raises UsageError."""
     if not path:
         return ()
     try:
