@@ -19,6 +19,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from . import quota, reading
 from .digests import engine
 from .limits import Limits
 from .metrics import Metrics
@@ -356,6 +357,11 @@ def _crash_of(record: Record, code: int, work: Path) -> Problem:
     with contextlib.suppress(OSError):
         said = (work / "worker.log").read_text("utf-8", "replace")[-4000:]
     log.warning("job %s: worker ended with %d\n%s", record.id, code, said)
+    if code == reading.TOO_LONG:
+        text = "opening and reading the stage took longer than this service allows (stage_seconds)"
+        return Problem("time-limit", text)
+    if code == -9 and quota.WORDS in said:
+        return Problem("limit-exceeded", f"the job was stopped: {quota.WORDS} (folder_bytes, folder_files)")
     if code in (-24, -25) or (code == -9 and "CPU" in said):
         return Problem("time-limit", "the job used more processor time than this service allows")
     if "bad_alloc" in said or "MemoryError" in said or "Cannot allocate memory" in said:

@@ -14,6 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from . import quota
 from .problems import Problem
 
 ENDED = ("done", "failed", "cancelled")
@@ -146,4 +147,4 @@ class Store:
                 os.replace(entry.path, self.folder(record.id) / entry.name)
 
     def drop_work(self, work: Path) -> None:
-        shutil.rmtree(work, ignore_errors=True)
+        quota.remove(str(work))

@@ -133,11 +133,13 @@ def until(true: Any, seconds: float = PATIENCE) -> None:
 
 @contextmanager
 def running(
-    data: Path, *words: str, environment: dict[str, str] | None = None, own_data: bool = True
-) -> Iterator[Server]:
-    """Start the service as a user would, and stop it. `own_data`: `data` is its folder, else it makes one itself."""
+    data: Path, *words: str, environment: dict[str, str] | None = None, own_data: bool = True,
+    program: tuple[str, ...] = ("-m", "refract_core.cli"),
+) -> Iterator[Server]:  # fmt: skip
+    """Start the service as a user would, and stop it. `own_data`: `data` is its folder, else it makes one itself.
+    `program`: what Python runs as `refract`."""
     folder = ("--data", str(data)) if own_data else ()
-    command = [sys.executable, "-m", "refract_core.cli", "serve", "--port", "0", *folder, *words]
+    command = [sys.executable, *program, "serve", "--port", "0", *folder, *words]
     log = data.parent / f"{data.name}.log"
     with open(log, "w") as errors:
         variables = {**os.environ, **(environment or {})}
