@@ -17,6 +17,8 @@ import sys
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
+from refract_core.errors import UsageError
+
 from . import namespaces, seccomp
 
 _NO_NEW_PRIVS, _PDEATHSIG, _DUMPABLE = 38, 1, 4
@@ -70,6 +72,13 @@ NEEDED = ("landlock", "seccomp", "capabilities")
 def missing(found: Mapping[str, object]) -> dict[str, str]:
     """What this machine does not enforce, and what that means, by the names in `available`."""
     return {name: text for name, text in _WITHOUT.items() if not found.get(name)}
+
+
+def required(found: Mapping[str, object]) -> None:
+    """Raises UsageError where a worker that is taken over would not be alone on this machine."""
+    lacking = [text for name, text in missing(found).items() if name in NEEDED]
+    if lacking:
+        raise UsageError(f"--require-confinement: this machine has {'; '.join(lacking)}")
 
 
 def die_with_parent() -> None:

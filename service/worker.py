@@ -47,7 +47,8 @@ def main() -> None:
     control = socket.socket(fileno=int(sys.argv[1]))
     os.dup2(2, 1)  # libraries print
     threads = _warm()
-    _send(control, {"ready": {**confine.available(), "threads": threads}})
+    found = confine.available()
+    _send(control, {"ready": {**found, "missing": list(confine.missing(found)), "threads": threads}})
     children: dict[int, _Given] = {}
     wake, waker = os.pipe()
     ears: list[Any] = [control, wake]

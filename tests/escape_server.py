@@ -21,5 +21,5 @@ class Popen(subprocess.Popen[bytes]):
 
 
 if __name__ == "__main__":
-    pool.subprocess.Popen = Popen  # type: ignore[misc]
+    pool.subprocess.Popen = Popen
     main()

@@ -18,6 +18,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -252,7 +253,7 @@ def try_all(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[s
         return {}
     victim = order["victim"]
     found = {name: attempt(what) for name, what in ways_out(victim, stage).items()}
-    hidden = {name: attempt(lambda what=what: what(victim)) for name, what in HIDDEN.items()}
+    hidden = {name: attempt(partial(what, victim)) for name, what in HIDDEN.items()}
     (Path(out) / "report.json").write_text(json.dumps({"refused": found, "hidden": hidden}))
     return {}
 
@@ -268,7 +269,7 @@ def fill_removed(_out: str) -> None:
     held = []
     for number in range(100):
         name = os.path.join(os.environ["TMPDIR"], f"a{number}")
-        file = open(name, "wb")
+        file = open(name, "wb")  # noqa: SIM115  held open, which is the point
         held.append(file)
         os.unlink(name)
         file.write(bytes(10 << 20))

@@ -134,7 +134,7 @@ def test_calls_have_the_numbers_of_the_kernels_headers(machine: str) -> None:
     tables: tuple[Any, ...] = (seccomp._ALLOWED, seccomp._PRETENDED, seccomp._NOT_THERE)
     ours = {name: numbers[column] for table in tables for name, numbers in table.items()}
     for rules in (seccomp._ONLY, seccomp._WITHOUT, seccomp._WITH):
-        ours |= {name: numbers[column] for name, (numbers, *_) in rules.items()}  # type: ignore[attr-defined]
+        ours |= {name: numbers[column] for name, (numbers, *_) in rules.items()}
     assert {name: number for name, number in ours.items() if number >= 0 and known.get(name) != number} == {}
 
 
@@ -163,7 +163,7 @@ def test_the_filter_says_of_every_call_what_the_list_says(machine: str) -> None:
     allow, deny, nothing, done, kill = 0x7FFF0000, 0x00050001, 0x00050026, 0x00050000, 0x80000000
     allowed = {numbers[column] for numbers in seccomp._ALLOWED.values()}
     asked = {numbers[column] for rules in (seccomp._ONLY, seccomp._WITHOUT, seccomp._WITH)
-             for numbers, *_ in rules.values()}  # type: ignore[attr-defined]  # fmt: skip
+             for numbers, *_ in rules.values()}  # fmt: skip
     pretended = {numbers[column] for numbers in seccomp._PRETENDED.values()}
     for number in range(463):
         if number not in asked:
@@ -174,7 +174,7 @@ def test_the_filter_says_of_every_call_what_the_list_says(machine: str) -> None:
 
     def of(name: str) -> int:
         return next(int(rules[name][0][column]) for rules in (seccomp._ONLY, seccomp._WITHOUT, seccomp._WITH)
-                    if name in rules)  # type: ignore[index, operator]  # fmt: skip
+                    if name in rules)  # fmt: skip
 
     assert verdict(of("kill"), 4321) == verdict(of("prlimit64"), 0) == verdict(of("prlimit64"), 4321) == allow
     assert verdict(of("kill"), 1) == verdict(of("kill"), 0) == verdict(of("prlimit64"), 1) == deny
