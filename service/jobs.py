@@ -19,6 +19,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from . import quota, reading
 from .bodies import own_stage
 from .digests import engine, file_digest, tree_digest
 from .discreet import own_folders, without_folders
@@ -451,6 +452,11 @@ def _crash_of(record: Record, code: int, work: Path) -> Problem:
     """What the end of a worker means to the client; its last words are for the log alone."""
     said = _last_words(work)
     log.warning("job %s: worker ended with %d\n%s", record.id, code, said)
+    if code == reading.TOO_LONG:
+        text = "opening and reading the stage took longer than this service allows (stage_seconds)"
+        return Problem("time-limit", text)
+    if code == -9 and quota.WORDS in said:
+        return Problem("limit-exceeded", f"the job was stopped: {quota.WORDS} (folder_bytes, folder_files)")
     if code in (-24, -25) or (code == -9 and "CPU" in said):
         return Problem("time-limit", "the job used more processor time than this service allows")
     if "bad_alloc" in said or "MemoryError" in said or "Cannot allocate memory" in said:

@@ -17,6 +17,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from refract_core.errors import UsageError
 
+from . import confine
 from .app import Settings, create_app
 from .edge import GUARDS
 from .gate import Gate, fitting
@@ -25,6 +26,7 @@ from .problems import Problem, of_status, respond
 
 _AT_ONCE, _BACKLOG = 32, 1024
 """Connections that asyncio takes in before the gate sees the first of them, and those that the system keeps for it."""
+log = logging.getLogger("refract.service")
 _LINGER = 1.0
 """[s] What a client still sends after an error is read and thrown away for this long: if the connection closed at
 once, its system would drop the answer."""
@@ -58,7 +60,11 @@ def serve(settings: Settings, host: str, port: int, log: str = "auto") -> None:
         listener.close()
         raise UsageError(f"--host {host} --port {port}: cannot be used: {error}") from error
     shown = f"[{host}]" if ":" in host else host
-    print(f"refract serves http://{shown}:{listener.getsockname()[1]}/", flush=True)
+    lacking = {} if settings.executor else confine.missing(confine.available())
+    for text in lacking.values():
+        log.warning("%s", text)
+    without = f" (workers are confined without {', '.join(lacking)})" if lacking else ""
+    print(f"refract serves http://{shown}:{listener.getsockname()[1]}/{without}", flush=True)
     _Server(config).run(sockets=[listener])
 
 

@@ -16,6 +16,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from . import quota
 from .problems import Problem
 
 ENDED = ("done", "failed", "cancelled")
@@ -190,12 +191,10 @@ class Store:
                 path.unlink(missing_ok=True)
 
     def drop_work(self, work: Path) -> None:
-        shutil.rmtree(work, ignore_errors=True)
+        quota.remove(str(work))
         self._given.discard(work)
 
     def drop_leavings(self) -> None:
-        """Remove workers' folders that could not be removed at once, such as when no descriptor was free for it, and
-        uploads that nobody has fetched for an hour."""
         for path in self.work.iterdir():
             if _WORK.match(path.name) and path not in self._given:
                 shutil.rmtree(path, ignore_errors=True)

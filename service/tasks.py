@@ -19,6 +19,7 @@ from refract_core.images.aovs import AOVS
 from refract_core.scene import Notice, Scene
 from refract_core.verbs.override import OverrideError, Overrides, override, override_notes
 
+from . import reading
 from .discreet import own_folders, own_places, without_folders
 from .problems import Problem
 
@@ -104,6 +105,7 @@ def _render(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[s
     scene = scene_from_stage(
         opened, time_code=settings.get("time_code"), purposes=wanted.purposes, camera=wanted.camera
     )
+    reading.has_ended()
     _check_scene(scene, limits)
     width, height = image_size(choose_camera(scene, wanted.camera), wanted.image_width, wanted.image_height)
     _check_size(width, height, wanted.samples, limits)
@@ -192,7 +194,13 @@ def _convert(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[
         model=settings.get("model") or "", only=tuple(settings.get("only") or ()),
         thickness=settings.get("thickness") or "typed", to=settings.get("to") or "",
     )  # fmt: skip
-    done = convert(order, lambda share, work: say(progress=share, stage=work))
+
+    def progress(share: float, work: str) -> None:
+        if share > 0.0:  # what is told of after the stage has been read
+            reading.has_ended()
+        say(progress=share, stage=work)
+
+    done = convert(order, progress)
     _tell(done.notices, say, limits)
     _write(out, _clean({
         "stage": stage, "out": "converted.usdz", "materials": [asdict(row) for row in done.rows],

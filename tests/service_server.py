@@ -134,16 +134,10 @@ def until(true: Any, seconds: float = PATIENCE) -> None:
 @contextmanager
 def running(
     data: Path, *words: str, environment: dict[str, str] | None = None, own_data: bool = True,
-    within: Sequence[str] = (),
+    within: Sequence[str] = (), program: tuple[str, ...] = ("-m", "refract_core.cli"),
 ) -> Iterator[Server]:  # fmt: skip
-    """Start the service as a user would, and stop it.
-
-    Args:
-        own_data: `data` is its folder, else it makes one itself.
-        within: words before the command, of a program that changes its surroundings and becomes the service.
-    """
     folder = ("--data", str(data)) if own_data else ()
-    command = [*within, sys.executable, "-m", "refract_core.cli", "serve", "--port", "0", *folder, *words]
+    command = [*within, sys.executable, *program, "serve", "--port", "0", *folder, *words]
     log = data.parent / f"{data.name}.log"
     with open(log, "w") as errors:
         variables = {**os.environ, **(environment or {})}

@@ -80,6 +80,15 @@ TokenFile = Annotated[
         "SCOPES. Without it, everybody may come.",
     ),
 ]
+RequireConfinement = Annotated[
+    bool,
+    typer.Option(
+        "--require-confinement",
+        envvar="REFRACT_REQUIRE_CONFINEMENT",
+        help="Do not start where the kernel lacks Landlock or seccomp, without which a worker that a stage has taken "
+        "over is not alone. Without it, the start and /readyz say what is missing.",
+    ),
+]
 Limit = Annotated[
     list[str] | None,
     typer.Option(
@@ -118,6 +127,7 @@ def serve(
     data: Data = "",
     executor: Executor = "",
     token_file: TokenFile = "",
+    require_confinement: RequireConfinement = False,
     limit: Limit = None,
     log: Log = "auto",
     limits: ShowLimits = False,
@@ -134,6 +144,12 @@ def serve(
             for row in table(chosen):
                 typer.echo(f"{row['name']:18} {row['value']:>12} {row['unit']:10} {row['meaning']}")
             return
+        if require_confinement:
+            from ..service import confine
+
+            if executor:
+                raise UsageError("--require-confinement looks at this machine, and --executor has others do the jobs")
+            confine.required(confine.available())
         from ..service.app import Settings
         from ..service.journal import KINDS
         from ..service.serve import serve as run
