@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import socket
 import sys
 from dataclasses import replace
@@ -62,7 +63,7 @@ def serve(settings: Settings, host: str, port: int, log: str = "auto") -> None:
     shown = f"[{host}]" if ":" in host else host
     lacking = {} if settings.executor else confine.missing(confine.available())
     for text in lacking.values():
-        log.warning("%s", text)
+        logging.getLogger("refract.service").warning("%s", text)
     without = f" (workers are confined without {', '.join(lacking)})" if lacking else ""
     print(f"refract serves http://{shown}:{listener.getsockname()[1]}/{without}", flush=True)
     _Server(config).run(sockets=[listener])
