@@ -15,7 +15,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -190,7 +190,14 @@ def fresh(**settings: Any) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def besieged(folder: Path, *words: str, descriptors: int = 0, data: Path | None = None) -> Iterator[Siege]:
+def besieged(
+    folder: Path,
+    *words: str,
+    descriptors: int = 0,
+    data: Path | None = None,
+    program: tuple[str, ...] = ("-m", "refract_core.cli"),
+    variables: Mapping[str, str] | None = None,
+) -> Iterator[Siege]:
     """A service with the default limits, until the end of the block.
 
     Args:
@@ -198,10 +205,12 @@ def besieged(folder: Path, *words: str, descriptors: int = 0, data: Path | None 
         words: further words of its command line.
         descriptors: RLIMIT_NOFILE of the service; 0 leaves it.
         data: its folder of jobs.
+        program: what Python runs as `refract`.
+        variables: further ones of its environment.
     """
     data, temporary = data or folder / "data", folder / "tmp"
     temporary.mkdir(exist_ok=True)
-    command = [sys.executable, "-m", "refract_core.cli", "serve", "--port", "0", "--stage-root", str(GOOD), "--data",
+    command = [sys.executable, *program, "serve", "--port", "0", "--stage-root", str(GOOD), "--data",
                str(data), *words]  # fmt: skip
     if descriptors:
         command = [sys.executable, "-c", _LOWER, str(descriptors), *command]
@@ -209,7 +218,7 @@ def besieged(folder: Path, *words: str, descriptors: int = 0, data: Path | None 
     with open(log, "a") as errors:
         process = subprocess.Popen(
             command, cwd=ROOT, stdout=subprocess.PIPE, stderr=errors, text=True,
-            env={**os.environ, "TMPDIR": str(temporary)},
+            env={**os.environ, "TMPDIR": str(temporary), **(variables or {})},
         )  # fmt: skip
     assert process.stdout
     try:

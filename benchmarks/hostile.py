@@ -50,7 +50,8 @@ def _whole(folder: Path) -> Iterator[tuple[str, bytes]]:
     for name in SEEDS:
         source = good / f"{name}.usda"
         flat = Usd.Stage.Open(str(source)).Flatten()
-        UsdUtils.ModifyAssetPaths(flat, lambda path: Path(path).name)  # it would name folders of this machine
+        UsdUtils.ModifyAssetPaths(flat, lambda path: Path(path).name)
+        flat.documentation = ""  # both would name folders of this machine
         for suffix in ("usda", "usdc"):
             flat.Export(str(folder / f"{name}.{suffix}"))
             yield f"{name}.{suffix}", (folder / f"{name}.{suffix}").read_bytes()
