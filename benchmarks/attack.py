@@ -504,22 +504,25 @@ PARTS: dict[str, Callable[[Path, Options], Iterator[Row]]] = {
 }
 
 
+HEAD = ("attack", "sent", "must not be", "told 501, 503, 507", "left behind", "memory", "recovered", "to know")
+
+
+def cells(row: Row) -> list[str]:
+    recovery = "never" if row.recovery is None else f"{row.recovery:.1f} s"
+    numbers = [f"{row.tally.sent:,}", str(len(row.tally.faults)), str(row.tally.told)]
+    left = ", ".join(row.leaks) or "nothing"
+    return [row.name, *numbers, left, f"{row.growth / _MEGA:+.0f} MiB", recovery, "; ".join(row.tally.notes) or "-"]
+
+
 def table(rows: Iterable[Row]) -> str:
     """Markdown, for the page."""
-    head = ["attack", "sent", "must not be", "told 501, 503, 507", "left behind", "memory", "recovered", "to know"]
-    return pages.table(head, [
-        [
-            row.name, f"{row.tally.sent:,}", str(len(row.tally.faults)), str(row.tally.told),
-            ", ".join(row.leaks) or "nothing", f"{row.growth / _MEGA:+.0f} MiB",
-            "never" if row.recovery is None else f"{row.recovery:.1f} s", "; ".join(row.tally.notes) or "-",
-        ]
-        for row in rows
-    ])  # fmt: skip
+    return pages.table(HEAD, [cells(row) for row in rows])
 
 
 def details(row: Row) -> str:
     """What the table has no room for."""
-    lines = [f"{row.name}: " + ", ".join(f"{count} {name}" for name, count in row.tally.outcomes.most_common())]
+    lines = [", ".join(f"{name}: {cell}" for name, cell in zip(HEAD, cells(row), strict=True))]
+    lines.append("    " + ", ".join(f"{count} {name}" for name, count in row.tally.outcomes.most_common()))
     return "\n".join([*lines, *(f"    MUST NOT BE: {fault}" for fault in row.tally.faults[:40])])
 
 
