@@ -26,7 +26,7 @@ _FILES_OF_ONE = 3
 _FILES_OF_WORKER = 4
 _OWN_FILES = 64
 _PARTING = 64
-"""Connections beyond the limit that are told 503; yet more are closed without a word."""
+"""Connections beyond the limit that have been told 503, and get a moment to hear it; for one more the first ends."""
 _LEAST = 8
 
 
@@ -43,7 +43,8 @@ class Gate:
     def __init__(self, most: int, metrics: Metrics) -> None:
         self.most, self.metrics = most, metrics
         self._inside: set[Connection] = set()
-        self._parting: set[Connection] = set()
+        self._parting: dict[Connection, None] = {}
+        """In the order they came."""
         self._waiting: dict[Connection, float] = {}
         """Since when; the longest first."""
 
@@ -53,8 +54,10 @@ class Gate:
             self.metrics.refused.labels("full").inc()
             log.warning("%d connections are open, and one more is refused", self.most)
             if len(self._parting) >= _PARTING:
-                connection.leave()
-            self._parting.add(connection)
+                first = next(iter(self._parting))
+                self.gone(first)
+                first.leave()
+            self._parting[connection] = None
             return False
         self._inside.add(connection)
         self.metrics.connections.set(len(self._inside))
@@ -83,7 +86,7 @@ class Gate:
     def gone(self, connection: Connection) -> None:
         self._waiting.pop(connection, None)
         self._inside.discard(connection)
-        self._parting.discard(connection)
+        self._parting.pop(connection, None)
         self.metrics.connections.set(len(self._inside))
 
 

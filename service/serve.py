@@ -92,7 +92,7 @@ def _patient(seconds: float, gate: Gate) -> type[H11Protocol]:
             super().connection_made(transport)
             if gate.enter(self):
                 self._watch()
-            elif not transport.is_closing():
+            else:
                 text = "too many connections are open"
                 self._refuse(Problem("unavailable", text, headers={"Retry-After": "2"}))
 

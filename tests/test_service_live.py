@@ -326,15 +326,19 @@ def test_the_gate_lets_go_of_who_waits_longest() -> None:
         assert gate.enter(first)
         now[0] += 0.5
         assert gate.enter(second)
-        assert not gate.enter(third)  # both are young
+        assert not gate.enter(One())  # both are young
         now[0] += 0.6
         gate.works(first)
-        assert not gate.enter(third)
+        assert not gate.enter(One())
         now[0] += 1.0
         assert gate.enter(third)
         assert (first.left, second.left) == (False, True)
         gate.gone(first)
         assert gate.enter(fourth)
+        crowd = [One() for _ in range(1000)]
+        assert not any(gate.enter(one) for one in crowd)
+        assert [one.left for one in crowd[:900]] == [True] * 900  # after they were told
+        assert not crowd[-1].left
 
     asyncio.run(work())
 
