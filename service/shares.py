@@ -299,7 +299,8 @@ class Shares:
         refused before it and have not come back yet is told of another place."""
         now = self.now()
         order = self.line.order()
-        running = [key for key in self._jobs if key not in order]
+        waiting = {*order}
+        running = [key for key in self._jobs if key not in waiting]
         left = [
             self.pace.left(self._jobs[key].kind, now - self._began.get(key, now), self.limits.job_seconds,
                            self._jobs[key].fraction)
