@@ -298,8 +298,9 @@ class Shares:
         """[s] until there is a place for a client that is refused now: for it alone, since each of those that were
         refused before it and have not come back yet is told of another place."""
         now = self.now()
-        order = self.line.order()
-        running = [key for key in self._jobs if key not in order]
+        order = [key for key in self.line.order() if key in self._jobs]
+        waiting = {*order}
+        running = [key for key in self._jobs if key not in waiting]
         left = [
             self.pace.left(self._jobs[key].kind, now - self._began.get(key, now), self.limits.job_seconds,
                            self._jobs[key].fraction)
