@@ -19,7 +19,7 @@ into docs/attack.md.
     bodies       bodies that trickle
     cancels      jobs that are cancelled, asked for again and left, all at once
     kills        kill -9 of the worker, of the process that forks workers, and of the service
-    descriptors  64 descriptors, 200 connections
+    descriptors  192 descriptors, 400 connections
     disk, inodes a folder of jobs without room; needs to be root, for a small tmpfs
 """
 
@@ -215,7 +215,7 @@ def _half_heads(siege: Siege, tally: Tally, count: int) -> None:
             except OSError as error:
                 tally.event("head", f"not taken: {type(error).__name__}")
         _meanwhile(siege, tally)
-    end = time.monotonic() + 30.0
+    end = time.monotonic() + RECOVERY
     for answer in asked:
         tally.answer("asks", answer.status_code, answer.text)
         if answer.status_code == 202:
@@ -239,7 +239,7 @@ def heads(siege: Siege, tally: Tally, options: Options) -> None:
 
 
 def descriptors(siege: Siege, tally: Tally, options: Options) -> None:
-    _half_heads(siege, tally, 200)
+    _half_heads(siege, tally, 400)
 
 
 def bodies(siege: Siege, tally: Tally, options: Options) -> None:
@@ -494,7 +494,7 @@ PARTS: dict[str, Callable[[Path, Options], Iterator[Row]]] = {
     "bodies": _part("64 bodies that trickle", bodies),
     "cancels": _part("cancel races", cancels),
     "kills": kills,
-    "descriptors": _part("64 descriptors", descriptors, descriptors=64),
+    "descriptors": _part("192 descriptors, 400 half-sent heads", descriptors, descriptors=192),
     "disk": _shortage("a full disk", "size=8m", _use_up_bytes),
     "inodes": _shortage("no inodes", "size=64m,nr_inodes=200", _use_up_inodes),
     "packages": _part("zip bombs", _bombs(hostile.package_bombs)),
