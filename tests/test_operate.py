@@ -72,14 +72,16 @@ def test_systemd_understands_the_unit(tmp_path: Path) -> None:
 def test_the_unit_leaves_what_workers_need_and_takes_the_rest() -> None:
     service = unit()
     assert int(service["LimitNOFILE"]) > 1024
-    for name in ("NoNewPrivileges", "DynamicUser", "PrivateTmp", "PrivateDevices", "ProtectHome", "RestrictNamespaces"):
+    for name in ("NoNewPrivileges", "DynamicUser", "PrivateTmp", "PrivateDevices", "ProtectHome", "RestrictSUIDSGID"):
         assert service[name] == "yes", name
     assert service["ProtectSystem"] == "strict"
     assert service["CapabilityBoundingSet"] == ""
     assert "MemoryDenyWriteExecute" not in service  # kernels
     assert service.get("ProcSubset", "all") == "all"  # /proc/meminfo
     calls = service["SystemCallFilter"].split()
-    assert {"landlock_create_ruleset", "landlock_add_rule", "landlock_restrict_self", "seccomp"} <= set(calls)
+    assert {"user", "mnt"} <= set(service["RestrictNamespaces"].split())
+    needed = {"landlock_create_ruleset", "landlock_add_rule", "landlock_restrict_self", "seccomp", "@mount", "unshare"}
+    assert needed <= set(calls)
 
 
 def test_stopping_waits_for_what_drains() -> None:
