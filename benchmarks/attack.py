@@ -56,7 +56,7 @@ RECOVERY = 120.0
 _AT_ONCE = 2
 _ENDLESS = (
     b"POST /v1/render HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; boundary=x\r\n"
-    b'Content-Length: 100000\r\n\r\n--x\r\nContent-Disposition: form-data; name="stage"; filename="a"\r\n\r\n#usda 1.0\n'
+    b'Content-Length: 100000\r\n\r\n--x\r\nContent-Disposition: form-data; name="stage"; filename="a"\r\n\r\n#usda'
 )
 """A request whose body has begun well."""
 _MEGA = 1 << 20
