@@ -370,8 +370,12 @@ def _killed_service(folder: Path) -> Row:
     tally = Tally()
     place = _new(folder)
     with besieged(place) as first:
-        where, family = _long_job(first), first.family()
+        for _ in range(4):
+            first.honest()
+        first.idle()
+        time.sleep(1.0)
         before = first.held()
+        where, family = _long_job(first), first.family()
         first.process.kill()
         first.process.wait()
         time.sleep(1.0)
