@@ -54,6 +54,11 @@ VERBS = ("render", "inspect", "validate", "convert")
 RECOVERY = 120.0
 """[s] What is not well by then stays ill."""
 _AT_ONCE = 2
+_ENDLESS = (
+    b"POST /v1/render HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; boundary=x\r\n"
+    b'Content-Length: 100000\r\n\r\n--x\r\nContent-Disposition: form-data; name="stage"; filename="a"\r\n\r\n#usda'
+)
+"""A request whose body has begun well."""
 _MEGA = 1 << 20
 
 
@@ -251,8 +256,7 @@ def bodies(siege: Siege, tally: Tally, options: Options) -> None:
             connection.settimeout(1.0)
             said, end = b"", time.monotonic() + 60.0
             with contextlib.suppress(OSError):
-                connection.sendall(b"POST /v1/render HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; "
-                                   b"boundary=x\r\nContent-Length: 100000\r\n\r\n--x")  # fmt: skip
+                connection.sendall(_ENDLESS)
                 while not stop.wait(1.0) and not said and time.monotonic() < end:
                     connection.sendall(b"a")
                     with contextlib.suppress(TimeoutError):
@@ -366,8 +370,12 @@ def _killed_service(folder: Path) -> Row:
     tally = Tally()
     place = _new(folder)
     with besieged(place) as first:
-        where, family = _long_job(first), first.family()
+        for _ in range(4):
+            first.honest()
+        first.idle()
+        time.sleep(1.0)
         before = first.held()
+        where, family = _long_job(first), first.family()
         first.process.kill()
         first.process.wait()
         time.sleep(1.0)
