@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 import logging
 import shutil
 from collections.abc import AsyncIterator, Mapping
@@ -17,6 +18,7 @@ from fastapi.responses import HTMLResponse, JSONResponse
 from fastapi.staticfiles import StaticFiles
 from starlette.exceptions import HTTPException as StarletteHTTPException
 from starlette.routing import Match
+from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from refract_core.errors import UsageError
 from refract_core.verbs.executors import scheduler_of
@@ -24,12 +26,17 @@ from refract_core.version import __version__
 
 from . import openapi, pages, routes
 from .edge import Edge
+from .holding import Hold
+from .hosts import door
 from .jobs import Jobs
+from .journal import Journal
 from .limits import Limits
 from .metrics import CONTENT_TYPE, Metrics
 from .pool import Nursery, Source
 from .problems import BY_STATUS, KINDS, MEDIA_TYPE, Problem, respond
+from .shortage import problem_of
 from .store import Store
+from .tokens import tokens_of
 
 log = logging.getLogger("refract.service")
 _STATIC = Path(__file__).parent / "static"
@@ -49,8 +56,16 @@ class Settings:
     """Jobs that may wait."""
     executor: str = ""
     """Address of a Dask cluster that does the jobs, `dask://HOST:PORT`; '' does them on this machine."""
+    host: str = ""
+    """Where it listens, `--host`; '' where another server listens for it."""
+    allow_hosts: tuple[str, ...] = ()
+    """Names that it answers to, beside `localhost` and `host`."""
+    allow_origins: tuple[str, ...] = ()
+    """Other sites whose pages may use it, such as `https://shop.example.org`."""
+    proxies: tuple[str, ...] = ()
+    """Addresses of reverse proxies, or networks of them, which are believed in `X-Forwarded-For`."""
     tokens: tuple[str, ...] = ()
-    """Bearer tokens, one of which every request under /v1 must bring; none means open to all."""
+    """Lines of a token file; every request under /v1 must bring one of the tokens. None means open to all."""
     limits: Limits = field(default_factory=Limits)
 
     def __post_init__(self) -> None:
@@ -62,8 +77,13 @@ class Settings:
             scheduler_of(self.executor)
         if self.stage_root and not Path(self.stage_root).is_dir():
             raise UsageError(f"--stage-root {self.stage_root}: there is no such folder")
-        if any(len(token) < 8 for token in self.tokens):
-            raise UsageError("a bearer token is shorter than 8 characters; take a long random one")
+        door(self.host, self.allow_hosts, self.allow_origins)
+        for proxy in self.proxies:
+            try:
+                ipaddress.ip_network(proxy)
+            except ValueError as error:
+                raise UsageError(f"--proxy {proxy}: write an address, such as 127.0.0.1, or 10.0.0.0/8") from error
+        tokens_of(self.tokens)
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
@@ -76,6 +96,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     metrics = Metrics()
     data = Path(settings.data or mkdtemp(prefix="refract-service-")).resolve()
     try:
+        hold = Hold(data)
         store = Store(data)
     except OSError as error:
         raise UsageError(f"--data {settings.data}: cannot be used: {error.strerror}") from error
@@ -92,6 +113,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             yield
         finally:
             await jobs.stop()
+            hold.release()
             if not settings.data:
                 shutil.rmtree(data, ignore_errors=True)
 
@@ -100,7 +122,11 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         description="Renders USD stages with glass in them.", redirect_slashes=False,
     )  # fmt: skip
     app.state.jobs, app.state.settings, app.state.metrics = jobs, settings, metrics
-    app.add_middleware(Edge, tokens=settings.tokens, metrics=metrics)
+    entry = door(settings.host, settings.allow_hosts, settings.allow_origins)
+    app.add_middleware(Edge, door=entry, tokens=tokens_of(settings.tokens), metrics=metrics)
+    app.add_middleware(Journal)  # around all others
+    if settings.proxies:
+        app.add_middleware(ProxyHeadersMiddleware, trusted_hosts=list(settings.proxies))
     _add_handlers(app)
     _add_pages(app, settings, metrics)
     app.include_router(routes.router)
@@ -144,6 +170,13 @@ def _add_handlers(app: FastAPI) -> None:
     async def on_validation(request: Request, error: Exception) -> Response:
         return respond(Problem("invalid-settings", "a parameter of the path or query is not valid"))
 
+    async def on_os_error(request: Request, error: Exception) -> Response:
+        problem = problem_of(error)
+        if problem is None:
+            return await on_anything(request, error)
+        log.warning("a request is refused: %s", error.strerror if isinstance(error, OSError) else error)
+        return respond(problem)
+
     async def on_anything(request: Request, error: Exception) -> Response:
         identifier = getattr(request.state, "request_id", "")
         log.error("request %s failed", identifier, exc_info=error)
@@ -153,6 +186,7 @@ def _add_handlers(app: FastAPI) -> None:
     app.add_exception_handler(StarletteHTTPException, on_http)
     app.add_exception_handler(HTTPException, on_http)
     app.add_exception_handler(RequestValidationError, on_validation)
+    app.add_exception_handler(OSError, on_os_error)
     app.add_exception_handler(Exception, on_anything)
 
 
@@ -179,7 +213,10 @@ def _add_pages(app: FastAPI, settings: Settings, metrics: Metrics) -> None:
             raise Problem("unavailable", why, headers={"Retry-After": "2"})
         if not jobs.store.writable():
             raise Problem("unavailable", "the folder of jobs cannot be written", headers={"Retry-After": "30"})
-        return JSONResponse({"status": "ready", "confinement": jobs.source.report})
+        slots = {"live": jobs.slots.live, "of": jobs.slots.count}
+        if not jobs.slots.live:
+            raise Problem("unavailable", "no slot for jobs lives; they are started again", headers={"Retry-After": "2"})
+        return JSONResponse({"status": "ready", "slots": slots, "confinement": jobs.source.report})
 
     @app.get("/metrics", summary="For Prometheus", response_class=Response)
     async def prometheus() -> Response:

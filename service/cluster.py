@@ -11,6 +11,7 @@ import contextlib
 import hashlib
 import logging
 import secrets
+import time
 import warnings
 from collections import OrderedDict
 from concurrent.futures import CancelledError
@@ -31,9 +32,16 @@ from .store import RESULTS
 log = logging.getLogger("refract.service")
 _AGAIN = 5.0  # [s] between attempts to reach the scheduler
 _LOOK = 0.5  # [s] between looks at who has joined
+_SILENCE = 10.0
+"""[s] Who says nothing for so long, a scheduler or a worker, is taken for cut off until it speaks again."""
+_PULSE = 2.0  # [s] between questions to a worker
 _KEPT = 4
 """Stages kept on the cluster for jobs to come."""
 _KNOWN_STAGES = 64
+
+
+class _Silent(Exception):
+    """The worker that has a job does not answer any more; others do."""
 
 
 class Remote:
@@ -44,6 +52,10 @@ class Remote:
         self.code: asyncio.Future[int] = asyncio.get_running_loop().create_future()
         self.lost = False
         self.future: Any = None
+        self.among: frozenset[str] = frozenset()
+        """Workers one of which must do it; none means any."""
+        self.move = asyncio.Event()
+        """It is to be done by another worker."""
         self.messages: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
         self._way: asyncio.Task[None] | None = None
 
@@ -88,7 +100,11 @@ class Cluster:
         self.address = address
         self.ready = asyncio.Event()
         self._reports: dict[str, dict[str, Any]] = {}
-        """By address of the Dask worker."""
+        """By address of the Dask worker, of those that answer."""
+        self._heard = 0.0
+        """When the scheduler answered last, by `time.monotonic`."""
+        self._silent: set[str] = set()
+        """Workers that do not answer, while the scheduler does and still counts on them."""
         self._topic = f"refract-{secrets.token_hex(8)}"
         self._remotes: dict[str, Remote] = {}
         self._content: OrderedDict[str, Any] = OrderedDict()
@@ -111,7 +127,7 @@ class Cluster:
         self._over = True
         if self._task:
             self._task.cancel()
-            await asyncio.gather(self._task, return_exceptions=True)
+            await asyncio.wait({self._task}, timeout=_SILENCE)  # a scheduler that hangs must not keep us
 
     async def fork(self) -> Remote:
         await self.ready.wait()
@@ -153,41 +169,92 @@ class Cluster:
         async with Client(
             scheduler_of(self.address), asynchronous=True, timeout=CONNECT_SECONDS, set_as_default=False
         ) as client:
+            attended: dict[str, asyncio.Task[None]] = {}
             try:
                 client.subscribe_topic(self._topic, self._hear)
                 self._client = client
-                greeted: dict[str, asyncio.Task[None]] = {}
                 while client.status == "running":
-                    there = set(await client.nthreads())
-                    for address in there - greeted.keys():
-                        greeted[address] = asyncio.create_task(self._greet(client, address))
-                    for address in greeted.keys() - there:
-                        greeted.pop(address).cancel()
-                        self._reports.pop(address, None)
-                    if self._reports:
-                        self.ready.set()
-                    else:
+                    try:
+                        async with asyncio.timeout(_SILENCE):
+                            await self._look(client, attended)
+                    except TimeoutError:  # a pause of the network; what runs is left alone, for it may pass
+                        if self.ready.is_set():
+                            log.warning("--executor %s: the scheduler does not answer", self.address)
                         self.ready.clear()
                     await asyncio.sleep(_LOOK)
             finally:
+                for task in attended.values():
+                    task.cancel()
                 self.ready.clear()
                 self._reports.clear()
+                self._silent.clear()
                 self._content.clear()
 
-    async def _greet(self, client: Any, address: str) -> None:
-        """Make one of the cluster's workers warm."""
+    async def _look(self, client: Any, attended: dict[str, asyncio.Task[None]]) -> None:
+        """Who is there, who does not answer, and whose jobs are to be done by others."""
+        there = set(await client.nthreads())
+        self._heard = time.monotonic()
+        for address in there - attended.keys():
+            attended[address] = asyncio.create_task(self._attend(client, address))
+        for address in attended.keys() - there:
+            attended.pop(address).cancel()
+            self._reports.pop(address, None)
+            self._silent.discard(address)
+        stuck: set[str] = set()
+        if self._silent:
+            held = await client.processing(list(self._silent))
+            stuck = {str(key) for keys in held.values() for key in keys}
+        live = self._reports.keys()
+        for remote in self._remotes.values():
+            if live and remote.future is not None:
+                nobody = bool(remote.among) and not remote.among & live
+                if nobody or remote.future.key in stuck:
+                    remote.move.set()
+        if live:
+            self.ready.set()
+        else:
+            self.ready.clear()
+
+    async def _attend(self, client: Any, address: str) -> None:
+        """Make one of the cluster's workers warm, and see whether it answers, for as long as it is there."""
+        report = await self._greet(client, address)
+        while report is not None:
+            asked = time.monotonic()
+            answer = asyncio.create_task(client.run(cluster_worker.answer, workers=[address], on_error="return"))
+            try:
+                await asyncio.wait({answer}, timeout=_SILENCE)
+                self._judge(address, report, asked, answer)
+            finally:
+                answer.cancel()
+            await asyncio.sleep(_PULSE)
+
+    def _judge(self, address: str, report: dict[str, Any], asked: float, answer: asyncio.Task[Any]) -> None:
+        """Whether a worker takes part, by its answer, if there is one yet."""
+        if answer.done():
+            if not answer.exception() and answer.result().get(address) is True:  # else the scheduler will tell
+                if address in self._silent:
+                    log.info("worker %s of the cluster answers again", address)
+                self._silent.discard(address)
+                self._reports[address] = report
+        elif self._heard > asked + _SILENCE / 2 and address not in self._silent:  # else it is the scheduler
+            log.warning("worker %s of the cluster does not answer; others do its jobs", address)
+            self._silent.add(address)
+            self._reports.pop(address, None)
+
+    async def _greet(self, client: Any, address: str) -> dict[str, Any] | None:
+        """Returns what confines processes there; None where it takes no jobs, which is told."""
         try:
-            version, report = await client.submit(
-                cluster_worker.greet, workers=[address], pure=False, key=f"refract-greet-{secrets.token_hex(8)}"
-            )
+            greeted = await client.run(cluster_worker.greet, workers=[address])
+            version, report = greeted[address]
         except Exception as error:
             log.warning("worker %s of the cluster takes no jobs: %s", address, _reason(error))
-            return
+            return None
         if version != engine():
             log.warning("worker %s of the cluster has refract %s, not %s; install the same", address, version, engine())
-            return
+            return None
         self._reports[address] = report
         log.info("worker %s of the cluster is ready", address)
+        return dict(report)
 
     def _hear(self, event: tuple[float, Any]) -> None:
         """A message of a job, by way of the scheduler."""
@@ -206,6 +273,14 @@ class Cluster:
             Problem: the files of the stage cannot be told.
             RefractError: no worker can do it.
         """
+        while True:
+            try:
+                return await self._try(remote, job)
+            except _Silent:
+                log.warning("a job is given to another worker of the cluster, since its own does not answer")
+                self._content.clear()  # it may have been there
+
+    async def _try(self, remote: Remote, job: dict[str, Any]) -> Ended:
         root, stage = Path(job["root"]), job["stage"]
         uploaded = root.parent == Path(job["folder"])
         paths = (stage,) if uploaded else await self._files_of(root, job)
@@ -223,11 +298,24 @@ class Cluster:
         return ended
 
     async def _submit(self, remote: Remote, order: Order, content: Any) -> Ended | None:
+        """Raises _Silent."""
+        remote.among = frozenset(self._reports if self._silent else ())
+        remote.move.clear()
         remote.future = remote.client.submit(
-            cluster_worker.perform, order, content, pure=False, key=f"refract-job-{secrets.token_hex(8)}"
-        )
-        ended: Ended | None = await remote.future
-        return ended
+            cluster_worker.perform, order, content, pure=False, key=f"refract-job-{secrets.token_hex(8)}",
+            workers=sorted(remote.among) or None,
+        )  # fmt: skip
+        result = asyncio.ensure_future(_result_of(remote.future))
+        moved = asyncio.create_task(remote.move.wait())
+        try:
+            await asyncio.wait({result, moved}, return_when=asyncio.FIRST_COMPLETED)
+            if result.done():
+                return result.result()
+            await remote.future.cancel(force=True)
+            raise _Silent
+        finally:
+            result.cancel()
+            moved.cancel()
 
     async def _files_of(self, root: Path, job: dict[str, Any]) -> tuple[str, ...]:
         """Paths of all a stage under the stage root is made of, looked up once for each state of that folder."""
@@ -250,6 +338,11 @@ class Cluster:
         self._content[key] = content
         while len(self._content) > _KEPT:
             self._content.popitem(last=False)
+
+
+async def _result_of(future: Any) -> Ended | None:
+    ended: Ended | None = await future
+    return ended
 
 
 def _same(content: dict[str, bytes]) -> dict[str, bytes]:

@@ -61,9 +61,15 @@ class Ended(NamedTuple):
     """what it made"""
 
 
-def greet() -> tuple[str, dict[str, Any]]:
-    """Get warm. Returns the engine's version, and what confines processes on this machine."""
-    return engine(), _home().report
+async def greet() -> tuple[str, dict[str, Any]]:
+    """Get warm, beside whatever work there is. Returns the engine's version, and what confines processes on this
+    machine."""
+    return engine(), await asyncio.to_thread(lambda: _home().report)
+
+
+async def answer() -> bool:
+    """To see whether this worker can be reached; whatever it works at, its loop is free."""
+    return True
 
 
 def perform(order: Order, content: Mapping[str, bytes] | None) -> Ended | None:

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import asyncio
-import hmac
 import re
-import secrets
 import time
 from collections.abc import Sequence
-from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
+from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from .hosts import Door
+from .journal import request_id
 from .metrics import Metrics
 from .problems import MEDIA_TYPE, Problem, of_status, respond
+from .shares import Client, address_of
+from .tokens import Token, needed, token_in
 
 _LINGER = 2.0
 """[s] A client that is still sending when it is refused would lose the answer if the connection closed at once."""
@@ -22,15 +24,14 @@ _RANGE = re.compile(rb"bytes=\s*(\d{0,18})-(\d{0,18})\s*", re.IGNORECASE)
 _POLICY = "default-src 'self'; img-src 'self' blob: data:; object-src 'none'; base-uri 'none'; frame-ancestors 'none'"
 GUARDS = ((b"x-content-type-options", b"nosniff"), (b"referrer-policy", b"no-referrer"),
           (b"content-security-policy", _POLICY.encode()))  # fmt: skip
-"""Headers that every answer carries."""
+"""Headers that every answer carries, beside what `Door.headers` says of other sites."""
 
 
 class Edge:
     """ASGI middleware."""
 
-    def __init__(self, app: ASGIApp, *, tokens: Sequence[str], metrics: Metrics) -> None:
-        self.app, self.metrics = app, metrics
-        self.tokens = [token.encode() for token in tokens]
+    def __init__(self, app: ASGIApp, *, door: Door, tokens: Sequence[Token], metrics: Metrics) -> None:
+        self.app, self.door, self.tokens, self.metrics = app, door, tokens, metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -39,9 +40,12 @@ class Edge:
         headers = Headers(scope=scope)
         unread = headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
         expects = headers.get("expect", "").lower() == "100-continue"
-        identifier = secrets.token_hex(8)
-        scope.setdefault("state", {})["request_id"] = identifier
+        identifier = request_id(headers.get("x-request-id"))
+        state = scope.setdefault("state", {})
+        state["request_id"] = identifier
+        state["client"] = Client(address_of((scope.get("client") or ("",))[0]))
         inner, answered = _for_the_app(scope), False
+        others = self.door.headers(scope["path"], headers.get("origin", ""))
 
         async def hear() -> Message:
             nonlocal unread
@@ -60,7 +64,8 @@ class Edge:
                 message, body = _as_problem(message)
                 route = getattr(inner.get("route"), "path", "none")
                 self.metrics.requests.labels(route, str(message["status"])).inc()
-                message["headers"] = [*message["headers"], (b"x-request-id", identifier.encode()), *GUARDS]
+                message["headers"] = [*message["headers"], (b"x-request-id", identifier.encode()), *GUARDS,
+                                      *others]  # fmt: skip
                 if unread:
                     message["headers"].append((b"connection", b"close"))
                 await send(message)
@@ -74,25 +79,46 @@ class Edge:
                 message = {"type": "http.response.body", "body": b"", "more_body": False}
             await send(message)
 
+        await (self._answer(scope, headers) or self.app)(inner, hear, say)
+
+    def _answer(self, scope: Scope, headers: Headers) -> Response | None:
+        """What is answered at the edge; None lets the request in."""
+        problem = _misled(headers, self.door)
+        if problem:
+            return respond(problem)
+        asked = headers.get("access-control-request-method")
+        if welcome := self.door.preflight(scope["method"], headers.get("origin", ""), asked):
+            return Response(status_code=204, headers=welcome)
         problem = self._refusal(scope, headers)
-        await (respond(problem) if problem else self.app)(inner, hear, say)
+        return respond(problem) if problem else None
 
     def _refusal(self, scope: Scope, headers: Headers) -> Problem | None:
-        path = scope["path"]
-        if self.tokens and guarded(path):
-            scheme, _, given = headers.get("authorization", "").partition(" ")
-            matches = [hmac.compare_digest(given.strip().encode(), token) for token in self.tokens]
-            if scheme.lower() != "bearer" or not any(matches):
+        wanted = needed(scope["method"], scope["path"])
+        if self.tokens and wanted:
+            token = token_in(headers.get("authorization", ""), self.tokens)
+            if token is None:
                 return Problem("unauthorized", "this service asks for a bearer token")
+            state = scope["state"]
+            state["client"] = state["client"]._replace(owner=token.owner)
+            if wanted not in token.scopes:
+                lacks = f'Bearer error="insufficient_scope", scope="{wanted}"'
+                return Problem("forbidden", f"the token has no scope {wanted}", headers={"WWW-Authenticate": lacks})
         origin = headers.get("origin")
-        if scope["method"] not in ("GET", "HEAD", "OPTIONS") and origin and not _same_host(origin, headers):
+        if scope["method"] not in ("GET", "HEAD", "OPTIONS") and origin and not self.door.lets_in(
+            origin, headers.get("host", "")
+        ):  # fmt: skip
             return Problem("cross-origin", "a page of another site may not ask for work here")
         return None
 
 
-def guarded(path: str) -> bool:
-    """Where a token is asked for, if there are any. The page and the documentation are for everybody."""
-    return path == "/metrics" or path.startswith("/v1/")
+def _misled(headers: Headers, door: Door) -> Problem | None:
+    """What is wrong with a request whatever it asks for."""
+    if "content-length" in headers and "transfer-encoding" in headers:
+        # A proxy before us may have gone by the other one: what follows could be another client's (RFC 9112, 6.1).
+        return Problem("bad-request", "Content-Length and Transfer-Encoding in one request; send one of them")
+    if not door.answers_to(headers.get("host")):
+        return Problem("misdirected", "this service does not go by the name in Host; see --allow-host")
+    return None
 
 
 def _for_the_app(scope: Scope) -> Scope:
@@ -126,13 +152,6 @@ def _as_problem(message: Message) -> tuple[Message, bytes | None]:
     answer = respond(of_status(message["status"]))
     kept = [(name, headers[name]) for name in (b"allow", b"content-range") if name in headers]
     return {**message, "headers": [*answer.raw_headers, *kept]}, bytes(answer.body)
-
-
-def _same_host(origin: str, headers: Headers) -> bool:
-    try:
-        return urlsplit(origin).netloc.lower() == headers.get("host", "").lower()
-    except ValueError:
-        return False
 
 
 async def _drain(hear: Receive) -> None:

@@ -8,15 +8,15 @@ from typing import Any, get_args
 from fastapi import FastAPI
 
 from . import models
-from .edge import guarded
 from .problems import KINDS, MEDIA_TYPE
+from .tokens import needed
 
 Answers = dict[int | str, dict[str, Any]]
 _PROBLEM = {"$ref": "#/components/schemas/ProblemDocument"}
 _TOKEN = "token"
-ALWAYS = (400, 431, 500)
+ALWAYS = (400, 421, 431, 500)
 """Problems that any request can meet."""
-WORK = (403, 406, 408, 409, 413, 415, 422, 429, 501, 503)
+WORK = (403, 406, 408, 409, 413, 415, 422, 429, 501, 503, 507)
 """Problems of a request that becomes a job, and of the job."""
 
 
@@ -27,9 +27,11 @@ def _header(text: str, kind: str = "string", *, required: bool = True, example: 
 
 _HEADERS_OF: dict[int, dict[str, Any]] = {
     401: {"WWW-Authenticate": _header("Bearer")},
+    403: {"WWW-Authenticate": _header("Bearer, and the scope that the token lacks", required=False)},
     416: {"Content-Range": _header("size of the result in bytes", example="bytes */1951")},
     429: {"Retry-After": _header("seconds after which to try again", "integer")},
     503: {"Retry-After": _header("seconds after which to try again", "integer")},
+    507: {"Retry-After": _header("seconds after which to try again", "integer")},
 }
 _RESULT_HEADERS = {
     "ETag": _header("strong; the same for the same stage, settings and engine"),
@@ -165,8 +167,8 @@ def _completed(found: dict[str, Any], tokens: bool) -> dict[str, Any]:
         " Every error is a problem document (RFC 9457). HEAD is answered wherever GET is, without the body."
     )
     for path, operations in found["paths"].items():
-        for operation in operations.values():
-            _complete(operation, guarded(path) and tokens)
+        for method, operation in operations.items():
+            _complete(operation, needed(method.upper(), path) if tokens else "")
     numbers = found["paths"]["/metrics"]["get"]["responses"]["200"]
     numbers["content"] = {"text/plain": {"schema": {"type": "string"}}}
     parts = found.setdefault("components", {})
@@ -177,15 +179,18 @@ def _completed(found: dict[str, Any], tokens: bool) -> dict[str, Any]:
     return found
 
 
-def _complete(operation: dict[str, Any], guard: bool) -> None:
+def _complete(operation: dict[str, Any], scope: str) -> None:
+    """`scope`: what a token must have; '' where none is asked for."""
     answers = operation["responses"]
     if "application/json" in answers.get("422", {}).get("content", {}):
         del answers["422"]
     for parameter in operation.get("parameters", ()):
         parameter["schema"] = _PATHS.get(parameter["name"], parameter["schema"])
-    if guard:
+    if scope:
         operation["security"] = [{_TOKEN: []}]
-    _add(answers, (*ALWAYS, 401) if guard else ALWAYS)
+        said = operation.get("description", "")
+        operation["description"] = f"{said}\n\nThe token needs the scope `{scope}`.".strip()
+    _add(answers, (*ALWAYS, 401, 403) if scope else ALWAYS)
     for status, answer in answers.items():
         answer["headers"] = {**_HEADERS_OF.get(int(status), {}), **answer.get("headers", {}), **_REQUEST_ID}
         if MEDIA_TYPE in answer.get("content", {}):

@@ -15,9 +15,13 @@ from typing import NamedTuple
 
 from pxr import Ar, Sdf, Tf, UsdUtils
 
+from refract_core.errors import StageError
 from refract_core.usd.diagnostics import captured
+from refract_core.usd.prim_count import count_prims
 
 _LAYERS = (".usd", ".usda", ".usdc", ".usdz")
+_OPINIONS = 8
+"""Specs a prim may be put together from, on average: what composing costs where few prims refer to much."""
 
 
 class Refused(Exception):
@@ -37,6 +41,23 @@ class Place(NamedTuple):
 
     def name(self) -> str:
         return f"{self.file}[{self.inner}]" if self.inner else self.file
+
+
+def check_size(path: str, prims: int) -> None:
+    """Refuse a stage of too many prims, before USD composes one of them. The layers must be checked already.
+
+    Raises:
+        TooMany: with the number that was found.
+    """
+    try:
+        found = count_prims(path, stop=prims)
+    except StageError:
+        return  # who opens it says why it cannot be read
+    if found.more or found.prims > prims:
+        raise TooMany(f"the stage would be composed of {found}; the limit is {prims} (prims)")
+    if found.opinions > _OPINIONS * prims:
+        text = f"the stage's {found} would be put together from {found.opinions} opinions"
+        raise TooMany(f"{text}; the limit is {prims} prims of {_OPINIONS} opinions each (prims)")
 
 
 def check_stage(path: str, root: str, *, layers: int, unpacked_bytes: int) -> None:

@@ -20,7 +20,9 @@ class Kind(NamedTuple):
 KINDS: dict[str, Kind] = {
     "bad-request": Kind(400, "The request cannot be read", "Send the body the documentation describes."),
     "unauthorized": Kind(401, "A token is needed", "Send `Authorization: Bearer TOKEN`."),
-    "cross-origin": Kind(403, "The request comes from another site", "Use the service's own page, or a program."),
+    "forbidden": Kind(403, "The token may not do this", "Use one with the scope that detail names."),
+    "cross-origin": Kind(403, "The request comes from another site",
+                         "Use the service's own page, a program, or a site named with `--allow-origin`."),
     "not-found": Kind(404, "There is nothing here", "Check the path; jobs and results are removed after some time."),
     "method-not-allowed": Kind(405, "The method is not allowed here", "Use a method that the Allow header names."),
     "not-acceptable": Kind(406, "No format that is accepted can be given", "Accept one of the types named in detail."),
@@ -30,6 +32,8 @@ KINDS: dict[str, Kind] = {
     "too-large": Kind(413, "The body is too large", "See /v1/limits."),
     "range-not-satisfiable": Kind(416, "The result does not reach that far", "Content-Range tells its size in bytes."),
     "unsupported-media-type": Kind(415, "The body is of a type that is not read", "Send JSON, or multipart with USD."),
+    "misdirected": Kind(421, "The service does not go by this name",
+                        "Ask by `localhost`, by the address it listens on, or by a name given with `--allow-host`."),
     "invalid-settings": Kind(422, "The settings are not valid", "`errors` names each field by a JSON pointer."),
     "stage-invalid": Kind(422, "The stage cannot be read", "Try `refract validate` on it."),
     "stage-refused": Kind(422, "The stage refers to something outside itself",
@@ -42,11 +46,18 @@ KINDS: dict[str, Kind] = {
                           "The stage is damaged, or it has found a fault of this program: whoever runs the service has "
                           "the reason in its log, under the job's id. Nothing else was affected."),
     "queue-full": Kind(429, "Too many jobs are waiting", "Try again after the time in Retry-After."),
+    "share-spent": Kind(429, "One client may not have more at once",
+                        "Let what is under way end, or try again after the time in Retry-After; `share` of /v1/limits "
+                        "says how much."),
     "head-too-large": Kind(431, "The head of the request is too large", "Send fewer or shorter headers."),
     "internal": Kind(500, "Something went wrong in the service", "Tell whoever runs it the request's id."),
+    "worker-fault": Kind(500, "The job met a fault of this program",
+                         "The stage may be in order: the program failed where it should have drawn it, or told what is "
+                         "wrong. Whoever runs the service has the reason in its log, under the job's id."),
     "transfer-coding": Kind(501, "The transfer coding is not known", "Send Content-Length, or chunks."),
     "interrupted": Kind(503, "The service stopped before the job was done", "Send the request again."),
     "unavailable": Kind(503, "The service takes no jobs now", "Try again after the time in Retry-After."),
+    "no-space": Kind(507, "The service has no room left", "Try again after the time in Retry-After."),
 }  # fmt: skip
 
 BY_STATUS = {404: "not-found", 405: "method-not-allowed", 413: "too-large", 415: "unsupported-media-type",
@@ -95,6 +106,6 @@ def document_response(document: dict[str, Any], headers: dict[str, str] | None =
     extra = {"Cache-Control": "no-store", **(headers or {})}
     if document["status"] == 401:
         extra["WWW-Authenticate"] = "Bearer"
-    if document["status"] in (429, 503):
+    if document["status"] in (429, 503, 507):
         extra.setdefault("Retry-After", "5")
     return Response(content, document["status"], extra, MEDIA_TYPE)

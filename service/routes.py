@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
 from starlette.responses import FileResponse, JSONResponse, StreamingResponse
+from starlette.types import Receive, Scope, Send
 
 from . import models, openapi
 from .bodies import own_stage, read_wish, stages
@@ -20,6 +21,7 @@ from .jobs import Jobs
 from .limits import table
 from .openapi import problems
 from .problems import Problem, document_response
+from .shares import Client
 from .store import RESULTS, Record
 
 router = APIRouter(prefix="/v1")
@@ -32,6 +34,11 @@ _CONVERTED = {"type": "object", "required": ["stage", "out", "materials", "notic
 def _jobs(request: Request) -> Jobs:
     jobs: Jobs = request.app.state.jobs
     return jobs
+
+
+def _client(request: Request) -> Client:
+    client: Client = request.state.client
+    return client
 
 
 # --- work -------------------------------------------------------------------------------------------------------------
@@ -93,7 +100,7 @@ def _chosen(request: Request, known: tuple[str, ...]) -> str:
 
 async def _work(request: Request, kind: str, extra: dict[str, Any], media: str) -> Response:
     jobs = _jobs(request)
-    with jobs.place():
+    with jobs.arriving(_client(request)):
         record = await _submit(request, kind, extra, jobs)
     if "respond-async" in request.headers.get("prefer", "").lower():
         jobs.keep(record)
@@ -118,10 +125,16 @@ async def _submit(request: Request, kind: str, extra: dict[str, Any], jobs: Jobs
             stage = own_stage(jobs.stage_root, wish.settings.stage)
             assert jobs.stage_root is not None
             digest = await asyncio.to_thread(tree_digest, jobs.stage_root, stage)
-        return jobs.submit(kind, settings, digest, stage, wish.upload)
+        return jobs.submit(kind, settings, digest, stage, wish.upload, _client(request))
     finally:
         if wish.upload:
             wish.upload.unlink(missing_ok=True)
+
+
+def _within(name: str, value: int, where: str, limits: Mapping[str, int]) -> None:
+    if value > limits[name]:
+        text = f"{name} would be {value}; the limit is {limits[name]}"
+        raise Problem("limit-exceeded", text, errors=[{"pointer": where, "detail": text}])
 
 
 def _check_limits(settings: dict[str, Any], jobs: Jobs) -> None:
@@ -132,10 +145,10 @@ def _check_limits(settings: dict[str, Any], jobs: Jobs) -> None:
         "pixels": (width * height, "/image_width"), "samples": (samples, "/samples"),
         "pixel_samples": (width * height * samples, "/samples"), "aovs": (len(settings.get("aovs", ())), "/aovs"),
     }  # fmt: skip
+    for side in ("image_width", "image_height"):
+        _within("side", settings.get(side) or 1, f"/{side}", limits)
     for name, (value, where) in asked.items():
-        if value > limits[name]:
-            text = f"{name} would be {value}; the limit is {limits[name]}"
-            raise Problem("limit-exceeded", text, errors=[{"pointer": where, "detail": text}])
+        _within(name, value, where, limits)
     for name in ("tiers", "purposes", "aovs"):
         if len(set(settings.get(name, ()))) != len(settings.get(name, ())):
             raise Problem("invalid-settings", f"{name} names something twice",
@@ -165,7 +178,7 @@ async def _done_or_gone(request: Request, jobs: Jobs, record: Record) -> bool:
 
 def _known(request: Request, identifier: str) -> Record:
     record = _jobs(request).records.get(identifier)
-    if record is None:
+    if record is None or record.owner != _client(request).owner:
         raise Problem("not-found", "there is no such job; it may have been removed")
     return record
 
@@ -190,26 +203,34 @@ async def cancel(request: Request, identifier: str) -> Response:
 async def events(request: Request, identifier: str) -> StreamingResponse:
     """Progress as server-sent events: `progress`, then one of `done`, `failed`, `cancelled`; data is the job."""
     record, jobs = _known(request, identifier), _jobs(request)
-    if jobs.streams >= jobs.limits.event_streams:
-        raise Problem("queue-full", "too many clients listen to events", headers={"Retry-After": "5"})
+    held = contextlib.ExitStack()
+    held.enter_context(jobs.shares.streams.one(_client(request), "streams of events"))
 
     async def stream() -> AsyncIterator[str]:
-        jobs.streams += 1
-        try:
-            while True:
-                event = record.status if record.ended else "progress"
-                yield f"event: {event}\ndata: {json.dumps(record.document(), allow_nan=False)}\n\n"
-                if record.ended:
-                    return
-                await asyncio.sleep(0.05)  # at most twenty a second
-                news = asyncio.create_task(jobs.news(record))
-                while not (await asyncio.wait({news}, timeout=_KEEP_ALIVE))[0]:
-                    yield ": still here\n\n"
-        finally:
-            jobs.streams -= 1
+        while True:
+            event = record.status if record.ended else "progress"
+            yield f"event: {event}\ndata: {json.dumps(record.document(), allow_nan=False)}\n\n"
+            if record.ended:
+                return
+            await asyncio.sleep(0.05)  # at most twenty a second
+            news = asyncio.create_task(jobs.news(record))
+            while not (await asyncio.wait({news}, timeout=_KEEP_ALIVE))[0]:
+                yield ": still here\n\n"
 
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-    return StreamingResponse(stream(), headers=headers, media_type="text/event-stream")
+    return _Held(held, stream(), headers=headers, media_type="text/event-stream")
+
+
+class _Held(StreamingResponse):
+    """A stream that gives something back at its end, also where its client has left before the first word."""
+
+    def __init__(self, held: contextlib.ExitStack, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.held = held
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        with self.held:
+            await super().__call__(scope, receive, send)
 
 
 def _file_of(record: Record, media: str = "") -> str:

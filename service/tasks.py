@@ -14,12 +14,13 @@ from typing import Any
 
 import numpy as np
 
-import refract_core
 from refract_core.errors import EmbreeError, ImageError, RefractError, SceneError, StageError, UsageError
 from refract_core.images.aovs import AOVS
 from refract_core.scene import Notice, Scene
 from refract_core.verbs.override import OverrideError, Overrides, override, override_notes
 
+from . import reading
+from .discreet import own_folders, own_places, without_folders
 from .problems import Problem
 
 Say = Callable[..., None]
@@ -56,6 +57,9 @@ def perform(kind: str, stage: str, out: str, settings: Mapping[str, Any], limits
                           errors=[{"pointer": "/camera", "detail": "the stage has no such camera"}]) from None
         raise Problem("invalid-settings", _public(str(error))) from None
     except (SceneError, ImageError) as error:
+        if "cannot be encoded" in str(error):  # a picture of ours, not of the stage
+            text = "a picture of this size and form is larger than this service or its format allows"
+            raise Problem("limit-exceeded", text) from error
         raise Problem("stage-invalid", _public(str(error))) from None
     except EmbreeError as error:
         slug = "memory-limit" if "memory" in str(error) else "stage-invalid"
@@ -72,11 +76,7 @@ def _public(text: str) -> str:
     if text.startswith("USD says:"):
         return "USD warned about this stage; `refract render` on it shows what it said"
     text = re.sub(_QUOTES, "", text).strip()
-    for folder in sorted({os.getcwd(), os.path.realpath("."), os.path.dirname(os.getcwd())}, key=len, reverse=True):
-        text = text.replace(folder + os.sep, "")
-    for known in (os.path.expanduser("~"), os.path.dirname(os.path.dirname(refract_core.__file__))):
-        text = text.replace(known, "")
-    return text[:500]
+    return without_folders(text, {*own_folders(), *own_places()})[:500]
 
 
 def _tell(notices: tuple[Notice, ...] | list[Notice], say: Say, limits: Mapping[str, int]) -> None:
@@ -106,6 +106,7 @@ def _render(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[s
     scene = scene_from_stage(
         opened, time_code=settings.get("time_code"), purposes=wanted.purposes, camera=wanted.camera
     )
+    reading.has_ended()
     _check_scene(scene, limits)
     width, height = image_size(choose_camera(scene, wanted.camera), wanted.image_width, wanted.image_height)
     _check_size(width, height, wanted.samples, limits)
@@ -144,7 +145,8 @@ def _check_scene(scene: Scene, limits: Mapping[str, int]) -> None:
 
 
 def _check_size(width: int, height: int, samples: int, limits: Mapping[str, int]) -> None:
-    asked = {"pixels": width * height, "samples": samples, "pixel_samples": width * height * samples}
+    asked = {"side": max(width, height), "pixels": width * height, "samples": samples,
+             "pixel_samples": width * height * samples}  # fmt: skip
     for name, value in asked.items():
         if value > limits[name]:
             what = f"{width} x {height} pixels with {samples} samples"
@@ -193,7 +195,13 @@ def _convert(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[
         model=settings.get("model") or "", only=tuple(settings.get("only") or ()),
         thickness=settings.get("thickness") or "typed", to=settings.get("to") or "",
     )  # fmt: skip
-    done = convert(order, lambda share, work: say(progress=share, stage=work))
+
+    def progress(share: float, work: str) -> None:
+        if share > 0.0:  # what is told of after the stage has been read
+            reading.has_ended()
+        say(progress=share, stage=work)
+
+    done = convert(order, progress)
     _tell(done.notices, say, limits)
     _write(out, _clean({
         "stage": stage, "out": "converted.usdz", "materials": [asdict(row) for row in done.rows],

@@ -5,8 +5,11 @@ from __future__ import annotations
 import re
 import shutil
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from subprocess import PIPE, Popen
 from typing import Any
@@ -32,7 +35,8 @@ CONTROLS = r"^\s*- (button|textbox|combobox|slider|spinbutton|checkbox|radio|pro
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     with playwright.sync_playwright() as driver:
-        opened = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"], timeout=PATIENCE)
+        words = ["--no-sandbox", "--host-resolver-rules=MAP *.test 127.0.0.1"]
+        opened = driver.chromium.launch(executable_path=CHROMIUM, args=words, timeout=PATIENCE)
         yield opened
         opened.close()
 
@@ -311,16 +315,31 @@ SERVE = """
 import sys
 from service.app import Settings
 from service.serve import serve
-serve(Settings(stage_root=sys.argv[1], data=sys.argv[2], workers=1), "127.0.0.1", 0)
+serve(Settings(stage_root=sys.argv[1], data=sys.argv[2], workers=1, allow_origins=tuple(sys.argv[3:])), "127.0.0.1", 0)
 """
 
 
 @pytest.fixture
-def real_url(tmp_path: Path) -> Iterator[str]:
-    """Address of the real service over the good samples."""
+def site_port(tmp_path: Path) -> Iterator[int]:
+    """Of a web server with an empty page, which goes by any name."""
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "index.html").write_text("<!doctype html><title>a site</title>")
+    handler = partial(SimpleHTTPRequestHandler, directory=str(tmp_path / "site"))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as site:
+        thread = threading.Thread(target=site.serve_forever, kwargs={"poll_interval": 0.05})
+        thread.start()
+        yield site.server_address[1]
+        site.shutdown()
+        thread.join()
+
+
+@pytest.fixture
+def real_url(tmp_path: Path, site_port: int) -> Iterator[str]:
+    """Address of the real service over the good samples. It lets in pages of shop.test."""
     pytest.importorskip("service.serve")
     root = Path(__file__).parents[1]
-    command = [sys.executable, "-c", SERVE, str(root / "usd_samples" / "good"), str(tmp_path)]
+    shop = f"http://shop.test:{site_port}"
+    command = [sys.executable, "-c", SERVE, str(root / "usd_samples" / "good"), str(tmp_path / "data"), shop]
     with Popen(command, stdout=PIPE, text=True, cwd=root) as process:
         assert process.stdout is not None
         said = next(line for line in process.stdout if "http://" in line)
@@ -345,4 +364,42 @@ def test_against_the_real_service(browser: Any, real_url: str) -> None:
     playwright.expect(opened.locator("#legend")).to_contain_text("1.24 m")
     opened.get_by_label("Samples per pixel").fill("4096")
     playwright.expect(opened.get_by_role("alert")).to_contain_text("limit")
+    opened.close()
+
+
+def test_a_page_of_a_name_bound_anew_is_shown_nothing(browser: Any, real_url: str) -> None:
+    """DNS rebinding: this browser is told that evil.test is this machine."""
+    port = real_url.rstrip("/").rpartition(":")[2]
+    opened = browser.new_page()
+    opened.set_default_timeout(PATIENCE)
+    answer = opened.goto(f"http://evil.test:{port}/v1/stages")
+    assert (answer.status, "marble" in answer.text()) == (421, False)
+    asked = opened.evaluate("async () => { const a = await fetch('/v1/stages'); return [a.status, await a.text()] }")
+    assert (asked[0], "marble" in asked[1]) == (421, False)
+    assert "marble.usda" in opened.goto(f"{real_url}v1/stages").text()
+    opened.close()
+
+
+ASK = """async ([url, method]) => {
+    const headers = {"Content-Type": "application/json", "Authorization": "Bearer none", "Prefer": "respond-async"};
+    const body = method === "POST" ? '{"stage": "marble.usda", "samples": 4000}' : undefined;
+    try {
+        const answer = await fetch(url, {method, headers, body});
+        return [answer.status, await answer.text(), answer.headers.get("X-Request-ID")];
+    } catch (error) { return [0, "", null] }
+}"""
+
+
+@pytest.mark.parametrize(("site", "allowed"), [("shop.test", True), ("evil.test", False)])
+def test_only_an_allowed_site_asks_and_reads(browser: Any, site_port: int, real_url: str, site: str,
+                                             allowed: bool) -> None:  # fmt: skip
+    """With headers that make a browser ask first."""
+    opened = browser.new_page()
+    opened.set_default_timeout(PATIENCE)
+    opened.goto(f"http://{site}:{site_port}/")
+    read = opened.evaluate(ASK, [f"{real_url}v1/stages", "GET"])
+    written = opened.evaluate(ASK, [f"{real_url}v1/render", "POST"])
+    assert (read[0], written[0]) == ((200, 422) if allowed else (0, 0))
+    assert ("marble.usda" in read[1], "limit-exceeded" in written[1]) == (allowed, allowed)
+    assert (read[2] is not None) is allowed
     opened.close()

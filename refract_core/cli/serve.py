@@ -13,6 +13,32 @@ from .app import app, outcome
 
 Host = Annotated[str, typer.Option(help="Address to listen on. The default takes requests of this machine only.")]
 Port = Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 takes a free one and prints it.")]
+AllowHost = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME",
+        envvar="REFRACT_ALLOW_HOST",
+        help="A name that requests may call the service by, beside localhost and --host; may be repeated. Others are "
+        "refused with 421, or any page could have its own name lead here.",
+    ),
+]
+AllowOrigin = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="ORIGIN",
+        envvar="REFRACT_ALLOW_ORIGIN",
+        help="Another site whose pages may use the service, such as https://shop.example.org; may be repeated.",
+    ),
+]
+Proxy = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="ADDRESS",
+        envvar="REFRACT_PROXY",
+        help="A reverse proxy, or a network of them, whose X-Forwarded-For is believed; may be repeated. Without it, "
+        "all its clients count as one, and share what one may have.",
+    ),
+]
 StageRoot = Annotated[
     str,
     typer.Option(
@@ -50,7 +76,17 @@ TokenFile = Annotated[
     typer.Option(
         metavar="FILE",
         envvar="REFRACT_TOKEN_FILE",
-        help="Bearer tokens, one a line, one of which each request must bring. Without it, everybody may come.",
+        help="Bearer tokens, one a line, one of which each request must bring: a token alone, or NAME sha256:HEX "
+        "SCOPES. Without it, everybody may come.",
+    ),
+]
+RequireConfinement = Annotated[
+    bool,
+    typer.Option(
+        "--require-confinement",
+        envvar="REFRACT_REQUIRE_CONFINEMENT",
+        help="Do not start where the kernel lacks Landlock or seccomp, without which a worker that a stage has taken "
+        "over is not alone. Without it, the start and /readyz say what is missing.",
     ),
 ]
 Limit = Annotated[
@@ -60,6 +96,15 @@ Limit = Annotated[
         metavar="NAME=NUMBER",
         help="Change one limit, such as job_seconds=60; may be repeated. /v1/limits and `--limits` list them. The "
         "environment does it too: REFRACT_LIMIT_JOB_SECONDS=60.",
+    ),
+]
+Log = Annotated[
+    str,
+    typer.Option(
+        metavar="KIND",
+        envvar="REFRACT_LOG",
+        help="Form of the log on stderr, which has a line for each request: text, json (an object a line), or auto, "
+        "which is text for a terminal and else json.",
     ),
 ]
 ShowLimits = Annotated[bool, typer.Option("--limits", help="Print every limit with its value, and exit.")]
@@ -73,13 +118,18 @@ _SENT = 32
 def serve(
     host: Host = "127.0.0.1",
     port: Port = 8000,
+    allow_host: AllowHost = None,
+    allow_origin: AllowOrigin = None,
+    proxy: Proxy = None,
     stage_root: StageRoot = "",
     workers: Workers = None,
     queue: Queue = 16,
     data: Data = "",
     executor: Executor = "",
     token_file: TokenFile = "",
+    require_confinement: RequireConfinement = False,
     limit: Limit = None,
+    log: Log = "auto",
     limits: ShowLimits = False,
 ) -> None:
     """Serve renders, conversions and checks over HTTP, with a page at /.
@@ -94,14 +144,25 @@ def serve(
             for row in table(chosen):
                 typer.echo(f"{row['name']:18} {row['value']:>12} {row['unit']:10} {row['meaning']}")
             return
+        if require_confinement:
+            from ..service import confine
+
+            if executor:
+                raise UsageError("--require-confinement looks at this machine, and --executor has others do the jobs")
+            confine.required(confine.available())
         from ..service.app import Settings
+        from ..service.journal import KINDS
         from ..service.serve import serve as run
 
+        if log not in KINDS:
+            raise UsageError(f"--log {log}: choose from {', '.join(KINDS)}")
         settings = Settings(
             stage_root=stage_root, data=data, executor=executor, queue=queue, tokens=_tokens(token_file), limits=chosen,
+            allow_hosts=tuple(allow_host or ()), allow_origins=tuple(allow_origin or ()),
+            proxies=tuple(proxy or ()),
             workers=workers if workers is not None else _SENT if executor else os.cpu_count() or 1,
         )  # fmt: skip
-        run(settings, host, port)
+        run(settings, host, port, log)
 
 
 def _numbers(given: list[str]) -> dict[str, int | None]:
@@ -124,7 +185,7 @@ def _numbers(given: list[str]) -> dict[str, int | None]:
 
 
 def _tokens(path: str) -> tuple[str, ...]:
-    """The tokens of a file, one a line; lines that begin with # are for people. Raises UsageError."""
+    """Lines of a file of tokens; those that begin with # are for people. Raises UsageError."""
     if not path:
         return ()
     try:

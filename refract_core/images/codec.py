@@ -46,9 +46,13 @@ def named_file(source: str | bytes, name: str) -> Iterator[str]:
 
 @contextmanager
 def memory_file() -> Iterator[str]:
-    """Path of an empty file in memory (where the system has that), which also works where nothing may be written."""
-    if hasattr(os, "memfd_create"):
+    """Path of an empty file in memory (where the system has and allows that), which also works where nothing may be
+    written; else in the folder for temporary files."""
+    try:
         descriptor = os.memfd_create("image")
+    except (AttributeError, OSError):
+        descriptor = -1
+    if descriptor >= 0:
         try:
             yield f"/proc/self/fd/{descriptor}"
         finally:

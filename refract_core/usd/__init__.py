@@ -5,6 +5,7 @@ __all__ = [
     "diagnostics",
     "layers",
     "materials",
+    "prim_count",
     "probes",
     "registering",
     "rules",

@@ -21,7 +21,7 @@ from .geometry.parts import Bound, Part, Tables, assemble, bind
 from .geometry.place import Placed, bounds_of, place, to_mesh, to_sphere
 from .geometry.shapes import INWARDS, TURN, Shape, read_shape
 from .geometry.skel import posed
-from .geometry.traverse import Placement, some_of, walk
+from .geometry.traverse import Placement, refuse_too_many, some_of, walk
 from .lights.read import read_lights
 from .ours import recognised
 from .probes.pictures import read_cubemap
@@ -42,7 +42,7 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
     What composition left out is reported by `scene_from_stage`, as notices of the scene.
 
     Raises:
-        StageError: the file is missing, unreadable, or not USD.
+        StageError: the file is missing, unreadable, or not USD, or its instances stand for millions of prims.
     """
     register()
     name = os.fspath(path)
@@ -70,6 +70,7 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
             if not layer.anonymous and not layer.dirty:
                 layer.Reload()
         recognised(stage)
+    refuse_too_many(stage)
     return stage
 
 

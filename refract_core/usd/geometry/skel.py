@@ -6,14 +6,20 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdSkel
 
 from ...scene import Notice
 from ..ours import recognised
+from .traverse import refuse_too_many
 
 _NESTED_INSTANCES = 64
 _CHANNELS = ("translations", "rotations", "scales", "blendShapeWeights")
 
 
 def posed(stage: Usd.Stage, time: Usd.TimeCode, notices: list[Notice]) -> Usd.Stage:
-    """The stage itself where nothing is skinned; else a second stage over the same layers with the skins baked."""
-    if not _of_type(stage, UsdSkel.Root):
+    """The stage itself where nothing is skinned; else a second stage over the same layers with the skins baked.
+
+    Raises:
+        StageError: its instances stand for more prims than can be looked at.
+    """
+    refuse_too_many(stage)
+    if not _is_in(stage, UsdSkel.Root):
         return stage
     copy = _copy(stage)
     moving = _hold(copy, time)
@@ -41,13 +47,41 @@ def _copy(stage: Usd.Stage) -> Usd.Stage:
     recognised(copy)  # last, for each of these composes again
     copy.SetEditTarget(session)
     for _ in range(_NESTED_INSTANCES):
-        prims = _of_type(copy, UsdSkel.Root) + _of_type(copy, UsdSkel.Animation)
-        instances = {_instance_above(prim).GetPath() for prim in prims if prim.IsInstanceProxy()}
+        instances = _outermost_instances(copy, _skinned_prototypes(copy))
         if not instances:
             break
         for path in instances:
             copy.GetPrimAtPath(path).SetInstanceable(False)
     return copy
+
+
+def _skinned_prototypes(stage: Usd.Stage) -> set[Sdf.Path]:
+    """Prototypes with a skeleton's root or animation in them, at any depth. Each is looked through once, whatever
+    number of places its instances stand in."""
+    inside = {prototype.GetPath(): list(Usd.PrimRange(prototype)) for prototype in stage.GetPrototypes()}
+    users: dict[Sdf.Path, list[Sdf.Path]] = {path: [] for path in inside}
+    for path, prims in inside.items():
+        for prim in prims:
+            if prim.IsInstance():
+                users[prim.GetPrototype().GetPath()].append(path)
+    waiting = [path for path, prims in inside.items() if any(map(_is_skinned, prims))]
+    found: set[Sdf.Path] = set()
+    while waiting:
+        path = waiting.pop()
+        if path not in found:
+            found.add(path)
+            waiting.extend(users[path])
+    return found
+
+
+def _outermost_instances(stage: Usd.Stage, prototypes: set[Sdf.Path]) -> list[Sdf.Path]:
+    """Where prototypes stand in the stage itself: an instance inside of another cannot be spoken of."""
+    prims = Usd.PrimRange.Stage(stage) if prototypes else ()
+    return [prim.GetPath() for prim in prims if prim.IsInstance() and prim.GetPrototype().GetPath() in prototypes]
+
+
+def _is_skinned(prim: Usd.Prim) -> bool:
+    return bool(prim.IsA(UsdSkel.Root) or prim.IsA(UsdSkel.Animation))
 
 
 def _hold(stage: Usd.Stage, time: Usd.TimeCode) -> bool:
@@ -78,7 +112,7 @@ def _of_type(stage: Usd.Stage, kind: type) -> list[Usd.Prim]:
     return [prim for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()) if prim.IsA(kind)]
 
 
-def _instance_above(proxy: Usd.Prim) -> Usd.Prim:
-    while proxy.IsInstanceProxy():
-        proxy = proxy.GetParent()
-    return proxy
+def _is_in(stage: Usd.Stage, kind: type) -> bool:
+    """Whether a prim of a type is anywhere. Prototypes are looked through, not the places they stand in."""
+    ranges = [Usd.PrimRange.Stage(stage), *(Usd.PrimRange(prototype) for prototype in stage.GetPrototypes())]
+    return any(prim.IsA(kind) for one in ranges for prim in one)

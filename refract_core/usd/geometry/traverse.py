@@ -81,6 +81,31 @@ def walk(stage: Usd.Stage, time: Usd.TimeCode, purposes: tuple[str, ...], notice
     return found
 
 
+def refuse_too_many(stage: Usd.Stage) -> None:
+    """Counts what native instances stand for, each prototype once: 30 of them, one in the other, may be 2^30 prims.
+
+    Raises:
+        StageError: they are more than `MAX_PRIMS`.
+    """
+    sizes: dict[Sdf.Path, int] = {}
+    waiting = [*stage.GetPrototypes()]
+    while waiting:
+        path = waiting[-1].GetPath()
+        prims = list(Usd.PrimRange(waiting[-1])) if path not in sizes else []
+        nested = [prim.GetPrototype() for prim in prims if prim.IsInstance()]
+        if below := {one.GetPath(): one for one in nested if one.GetPath() not in sizes}:
+            waiting.extend(below.values())
+            continue
+        waiting.pop()
+        sizes.setdefault(path, len(prims) + sum(sizes[one.GetPath()] - 1 for one in nested))
+    if not sizes:
+        return
+    every = sum(sizes[prim.GetPrototype().GetPath()] if prim.IsInstance() else 1 for prim in Usd.PrimRange.Stage(stage))
+    if every > MAX_PRIMS:
+        text = f"the stage has {every} prims once its instances are expanded; at most {MAX_PRIMS} can be looked at"
+        raise StageError(f"{stage.GetRootLayer().identifier}: {text}")
+
+
 def some_of(paths: list[str]) -> str:
     """How many there are and the first few by name."""
     first = ", ".join(paths[:3]) + (", ..." if len(paths) > 3 else "")
