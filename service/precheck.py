@@ -53,7 +53,10 @@ def check_size(path: str, prims: int) -> None:
         found = count_prims(path, stop=prims)
     except StageError:
         return  # who opens it says why it cannot be read
-    if found.more or found.prims > prims:
+    if found.more:
+        text = f"the stage would be composed of more prims than can be counted, {found.prims} by then"
+        raise TooMany(f"{text}; the limit is {prims} (prims)")
+    if found.prims > prims:
         raise TooMany(f"the stage would be composed of {found}; the limit is {prims} (prims)")
     if found.opinions > _OPINIONS * prims:
         text = f"the stage's {found} would be put together from {found.opinions} opinions"
