@@ -130,7 +130,7 @@ def _limit_means(means: Means) -> None:
         (resource.RLIMIT_CPU, cpu, cpu + 2),
         (resource.RLIMIT_FSIZE, means.file_bytes, means.file_bytes),
         (resource.RLIMIT_NOFILE, means.open_files, means.open_files),
-        (resource.RLIMIT_CORE, 0, 0),
+        (resource.RLIMIT_CORE, 1, 1),  # 0 still wakes a program that gathers dumps; 1 does not (core(5))
     ):
         ceiling = resource.getrlimit(what)[1]
         top = hard if ceiling == resource.RLIM_INFINITY else min(hard, ceiling)

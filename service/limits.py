@@ -32,7 +32,7 @@ class Limits:
     settings_bytes: int = _limit(256 << 10, "bytes", "settings of one request, as JSON")
     stage_bytes: int = _limit(64 << 20, "bytes", "one uploaded stage, and what its package holds when unpacked")
     layers: int = _limit(256, "files", "layers that one stage is composed of")
-    prims: int = _limit(500_000, "prims", "prims of a stage, instances counted, told before it is composed")
+    prims: int = _limit(200_000, "prims", "prims of a stage, instances counted, told before it is composed")
     pixels: int = _limit(1 << 22, "pixels", "width times height of a picture")
     samples: int = _limit(64, "per pixel", "samples of a pixel")
     side: int = _limit(16384, "pixels", "width, and height, of a picture")

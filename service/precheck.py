@@ -53,15 +53,20 @@ def check_size(path: str, prims: int) -> None:
         found = count_prims(path, stop=prims)
     except StageError:
         return  # who opens it says why it cannot be read
-    if found.more or found.prims > prims:
+    if found.more:
+        text = f"the stage would be composed of more prims than can be counted, {found.prims} by then"
+        raise TooMany(f"{text}; the limit is {prims} (prims)")
+    if found.prims > prims:
         raise TooMany(f"the stage would be composed of {found}; the limit is {prims} (prims)")
     if found.opinions > _OPINIONS * prims:
         text = f"the stage's {found} would be put together from {found.opinions} opinions"
         raise TooMany(f"{text}; the limit is {prims} prims of {_OPINIONS} opinions each (prims)")
 
 
-def check_stage(path: str, root: str, *, layers: int, unpacked_bytes: int) -> None:
+def check_stage(path: str, root: str, *, layers: int, unpacked_bytes: int) -> list[Sdf.Layer]:
     """Refuse a stage that reaches outside `root`, in any variant, payload, clip or texture.
+
+    Returns its layers: while they are held, whoever opens the stage does not read their files again.
 
     Args:
         path: the root layer.
@@ -78,11 +83,12 @@ def check_stage(path: str, root: str, *, layers: int, unpacked_bytes: int) -> No
     _inside(first.file, root, os.path.basename(path))
     waiting, seen = deque([first]), {first}
     packages: dict[str, frozenset[str]] = {}
+    held: list[Sdf.Layer] = []
     while waiting:
         here = waiting.popleft()
         if not here.inner and here.file.lower().endswith(".usdz") and os.path.isfile(here.file):
             packages[here.file] = _package(here.file, unpacked_bytes)
-        for name, composed in _names(here):
+        for name, composed in _names(here, held):
             found = _resolved(name, here, root)
             if found is None or found in seen or not composed:
                 continue
@@ -90,10 +96,12 @@ def check_stage(path: str, root: str, *, layers: int, unpacked_bytes: int) -> No
             if len(seen) > layers:
                 raise TooMany(f"the stage is made of more than {layers} layers")
             waiting.append(found)
+    return held
 
 
-def _names(place: Place) -> list[tuple[str, bool]]:
-    """What a layer refers to, and whether as another layer. A layer that cannot be read refers to nothing."""
+def _names(place: Place, held: list[Sdf.Layer]) -> list[tuple[str, bool]]:
+    """What a layer refers to, and whether as another layer. A layer that cannot be read refers to nothing; one that can
+    is added to `held`."""
     if not place.inner and not os.path.isfile(place.file):
         return []
     if not (place.inner or place.file).lower().endswith(_LAYERS):
@@ -103,6 +111,7 @@ def _names(place: Place) -> list[tuple[str, bool]]:
             layer = Sdf.Layer.FindOrOpen(place.name())
             if not layer:
                 return []
+            held.append(layer)
             composed = {str(name) for name in layer.GetCompositionAssetDependencies()}
             every = [str(name) for part in UsdUtils.ExtractExternalReferences(place.name()) for name in part]
         except Tf.ErrorException:

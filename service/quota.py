@@ -31,6 +31,8 @@ class Quota(NamedTuple):
     def excess(self, pid: int) -> str:
         """What a worker takes too much of, for its log; '' where all is well."""
         found = _Seen(self.most_bytes, self.most_files)
+        with suppress(OSError):
+            found.add(os.stat(os.path.join(self.folder, "worker.log")))
         waiting = [os.path.join(self.folder, name) for name in ("out", "tmp")]
         try:
             while waiting and not found.too_much:

@@ -275,13 +275,15 @@ def _perform(job: dict[str, Any], say: Any) -> Any:
         return _try_to_escape(job["forbidden"])
     reading.begins(limits["stage_seconds"])
     try:
-        precheck.check_stage(job["stage"], root, layers=limits["layers"], unpacked_bytes=limits["stage_bytes"])
+        held = precheck.check_stage(job["stage"], root, layers=limits["layers"], unpacked_bytes=limits["stage_bytes"])
         precheck.check_size(job["stage"], limits["prims"])
     except precheck.TooMany as error:
         raise Problem("limit-exceeded", str(error)) from None
     except precheck.Refused as error:
         raise Problem("stage-refused", str(error)) from None
-    return tasks.perform(job["kind"], job["stage"], out, job["settings"], limits, say)
+    done = tasks.perform(job["kind"], job["stage"], out, job["settings"], limits, say)
+    del held  # until here, for USD to find its layers read
+    return done
 
 
 def own_files() -> list[str]:

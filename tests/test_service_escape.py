@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -12,10 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
-from service_server import BALL, ROOT, SMALL, Server, running, upload
+from service_server import BALL, ROOT, SMALL, Server, running, until, upload
 from service_stages import laughs
 
+from refract_core import RenderSettings, load_stage, render
+from refract_core.images.codec import read_channels
 from service import confine, namespaces, quota, seccomp, worker
 from service.limits import Limits
 
@@ -54,6 +58,11 @@ def order(do: str, victim: Path) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def report(server: Server) -> dict[str, dict[str, str]]:
+    return outcomes(server)
+
+
+def outcomes(server: Server) -> dict[str, dict[str, str]]:
+    """What became of every attempt, by name; what they were about is as it was."""
     victim = server.data.parent / "victim"
     before = victim.stat()
     shared = shared_memory()
@@ -81,6 +90,18 @@ def test_no_way_leads_out_of_a_worker(report: dict[str, dict[str, str]]) -> None
 
 
 @locked
+def test_the_list_of_calls_is_enough_where_there_are_no_namespaces(tmp_path: Path) -> None:
+    (tmp_path / "victim").write_text("theirs")
+    with running(tmp_path / "data", "--workers", "1", program=(*PROGRAM, "--without-namespaces")) as server:
+        found = outcomes(server)
+        with server.client() as client:
+            assert client.get("/readyz").json()["confinement"]["missing"] == ["namespaces"]
+            answer = client.post("/v1/render", files=upload(BALL), data={"settings": json.dumps(SMALL)})
+            assert answer.status_code == 200
+    assert {name for name, outcome in found["refused"].items() if not outcome.startswith("refused")} == set()
+
+
+@locked
 @pytest.mark.skipif(not namespaces.works(), reason="this machine lets nobody make namespaces")
 def test_a_worker_cannot_tell_what_is_there(report: dict[str, dict[str, str]]) -> None:
     assert {name for name, outcome in report["hidden"].items() if not outcome.startswith("refused")} == set()
@@ -91,8 +112,25 @@ def test_a_worker_cannot_tell_what_is_there(report: dict[str, dict[str, str]]) -
 def test_a_worker_that_takes_too_much_is_ended(client: httpx.Client, server: Server, do: str) -> None:
     answer = client.post("/v1/inspect", files=order(do, server.data))
     assert answer.json()["type"] == "/problems/limit-exceeded", answer.text
-    left = [path for path in (server.data / "work").rglob("*") if path.name.startswith("a")]
-    assert left == []
+    until(lambda: not [path for path in (server.data / "work").rglob("*") if re.fullmatch(r"a\d+|a{200}", path.name)])
+
+
+def test_every_sample_is_drawn_in_a_worker_as_it_is_without(tmp_path: Path) -> None:
+    """Honest work needs no call that is refused, and no file that is hidden: the pictures are the same to the bit."""
+    samples = ROOT / "usd_samples" / "good"
+    settings = {"image_width": 48, "samples": 1}
+    with running(tmp_path / "data", "--workers", "1", "--stage-root", str(samples)) as server:
+        for path in sorted(samples.glob("*.usda")):
+            with server.client() as client:
+                answer = client.post("/v1/render", json={"stage": path.name, **settings})
+                job = client.get(answer.headers["content-location"]).json()
+            assert answer.status_code == 200, (path.name, answer.text)
+            assert job["warnings"] == [], path.name
+            (tmp_path / "theirs.png").write_bytes(answer.content)
+            frame = render(load_stage(path), RenderSettings(image_width=48, samples=1))
+            frame.save(str(tmp_path / "ours.png"))
+            theirs, ours = (read_channels(str(tmp_path / name), name).pixels for name in ("theirs.png", "ours.png"))
+            np.testing.assert_array_equal(theirs, ours, err_msg=path.name)
 
 
 @pytest.mark.parametrize("stage", [laughs(30), laughs(30, instanceable=True)])
@@ -105,6 +143,22 @@ def test_prims_are_counted_before_usd_composes_them(client: httpx.Client, stage:
     assert answer.json()["detail"] == (
         f"the stage would be composed of {number} prims; the limit is {Limits().prims} (prims)"
     )
+
+
+def test_a_stage_that_is_slow_to_compose_has_a_limit_of_its_own(tmp_path: Path) -> None:
+    """45,150 prims, which is few; each is looked for in up to 300 places, which is slow."""
+    chain = "".join(
+        f'def "A{n}" (\n    references = </A{n - 1}>\n)\n{{\n    def "b{n}"\n    {{\n    }}\n}}\n'
+        for n in range(1, 300)
+    )
+    words = ("--workers", "1", "--limit", "stage_seconds=2")
+    with running(tmp_path / "data", *words) as server, server.client() as client:
+        for verb in ("render", "inspect", "convert"):
+            answer = client.post(f"/v1/{verb}", files=upload(f'#usda 1.0\ndef "A0"\n{{\n}}\n{chain}'))
+            assert answer.json()["type"] == "/problems/time-limit", answer.text
+            assert "stage_seconds" in answer.json()["detail"]
+        answer = client.post("/v1/render", files=upload(BALL), data={"settings": json.dumps(SMALL)})
+        assert answer.status_code == 200
 
 
 # --- the parts

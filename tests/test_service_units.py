@@ -13,7 +13,7 @@ from typing import Any, get_args
 import pytest
 from pxr import UsdUtils
 from service_server import ROOT, InProcess
-from service_stages import HEAD, escapes, referring
+from service_stages import HEAD, escapes, laughs, referring
 
 from refract_core.errors import UsageError
 from refract_core.images.aovs import AOVS
@@ -144,6 +144,24 @@ def test_too_many_layers_are_refused(tmp_path: Path) -> None:
     precheck.check_stage(str(tmp_path / "0.usda"), root, layers=6, unpacked_bytes=1000)
     with pytest.raises(precheck.TooMany):
         precheck.check_stage(str(tmp_path / "0.usda"), root, layers=3, unpacked_bytes=1000)
+
+
+PAIRS = "".join(f'def "a{n}"\n{{\n    def "b"\n    {{\n    }}\n}}\n' for n in range(1100))
+LADDER = 'def "N0"\n{\n}\ndef "N1"\n{\n}\n' + "".join(
+    f'def "N{n}" (\n    references = [</N{n - 1}>, </N{n - 2}>]\n)\n{{\n}}\n' for n in range(2, 40)
+)
+
+
+@pytest.mark.parametrize(
+    ("stage", "words"),
+    [(laughs(30), "2147483616 prims; the limit is 1000"), (HEAD + PAIRS, "more prims than can be counted"),
+     (HEAD + LADDER, "opinions; the limit is 1000 prims of 8")],
+)  # fmt: skip
+def test_too_many_prims_are_refused_with_their_number(tmp_path: Path, stage: str, words: str) -> None:
+    (tmp_path / "a.usda").write_text(stage)
+    with pytest.raises(precheck.TooMany, match=words):
+        precheck.check_size(str(tmp_path / "a.usda"), 1000)
+    precheck.check_size(str(GOOD / "marble.usda"), 1000)
 
 
 def test_samples_and_their_packages_pass(tmp_path: Path) -> None:

@@ -29,6 +29,8 @@ class Tables:
     """Place in `materials` by prim path ('' for displayColor) and whether the mesh is closed (is transparent)."""
     of_instances: dict[tuple[str, str], F32 | None] = field(default_factory=dict)
     """Values per instance by point instancer and primvar."""
+    uniform: dict[tuple[int, int], I32] = field(default_factory=dict)
+    """Material of each triangle where all have the same, by their number and the material's; not to be written to."""
 
 
 class Bound(NamedTuple):
@@ -112,7 +114,10 @@ def _triangle_materials(prim: Usd.Prim, shape: Shape, bound: Bound, tables: Tabl
     """Row of the material table for each triangle, shape (T,): by GeomSubset, else by the prim."""
     if shape.topology is None or not bound.subsets:
         number = _material_number(prim, shape, bound.material, tables)
-        return np.full(len(shape.triangles), number, np.int32)
+        key = (len(shape.triangles), number)
+        if key not in tables.uniform:  # thousands of instances are alike: one array is enough for them
+            tables.uniform[key] = np.full(len(shape.triangles), number, np.int32)
+        return tables.uniform[key]
     of_face = np.full(shape.topology.face_count, -1, np.int32)
     for subset, material in bound.subsets:
         faces = _subset_faces(subset, shape.topology.face_count, tables)
