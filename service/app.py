@@ -26,12 +26,15 @@ from refract_core.version import __version__
 
 from . import openapi, pages, routes
 from .edge import Edge
+from .holding import Hold
 from .hosts import door
 from .jobs import Jobs
+from .journal import Journal
 from .limits import Limits
 from .metrics import CONTENT_TYPE, Metrics
 from .pool import Nursery, Source
 from .problems import BY_STATUS, KINDS, MEDIA_TYPE, Problem, respond
+from .shortage import problem_of
 from .store import Store
 from .tokens import tokens_of
 
@@ -93,6 +96,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     metrics = Metrics()
     data = Path(settings.data or mkdtemp(prefix="refract-service-")).resolve()
     try:
+        hold = Hold(data)
         store = Store(data)
     except OSError as error:
         raise UsageError(f"--data {settings.data}: cannot be used: {error.strerror}") from error
@@ -109,6 +113,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             yield
         finally:
             await jobs.stop()
+            hold.release()
             if not settings.data:
                 shutil.rmtree(data, ignore_errors=True)
 
@@ -119,7 +124,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.jobs, app.state.settings, app.state.metrics = jobs, settings, metrics
     entry = door(settings.host, settings.allow_hosts, settings.allow_origins)
     app.add_middleware(Edge, door=entry, tokens=tokens_of(settings.tokens), metrics=metrics)
-    if settings.proxies:
+    app.add_middleware(Journal)
+    if settings.proxies:  # around all others, so that the log too has the client
         app.add_middleware(ProxyHeadersMiddleware, trusted_hosts=list(settings.proxies))
     _add_handlers(app)
     _add_pages(app, settings, metrics)
@@ -164,6 +170,13 @@ def _add_handlers(app: FastAPI) -> None:
     async def on_validation(request: Request, error: Exception) -> Response:
         return respond(Problem("invalid-settings", "a parameter of the path or query is not valid"))
 
+    async def on_os_error(request: Request, error: Exception) -> Response:
+        problem = problem_of(error)
+        if problem is None:
+            return await on_anything(request, error)
+        log.warning("a request is refused: %s", error.strerror if isinstance(error, OSError) else error)
+        return respond(problem)
+
     async def on_anything(request: Request, error: Exception) -> Response:
         identifier = getattr(request.state, "request_id", "")
         log.error("request %s failed", identifier, exc_info=error)
@@ -173,6 +186,7 @@ def _add_handlers(app: FastAPI) -> None:
     app.add_exception_handler(StarletteHTTPException, on_http)
     app.add_exception_handler(HTTPException, on_http)
     app.add_exception_handler(RequestValidationError, on_validation)
+    app.add_exception_handler(OSError, on_os_error)
     app.add_exception_handler(Exception, on_anything)
 
 
@@ -199,7 +213,10 @@ def _add_pages(app: FastAPI, settings: Settings, metrics: Metrics) -> None:
             raise Problem("unavailable", why, headers={"Retry-After": "2"})
         if not jobs.store.writable():
             raise Problem("unavailable", "the folder of jobs cannot be written", headers={"Retry-After": "30"})
-        return JSONResponse({"status": "ready", "confinement": jobs.source.report})
+        slots = {"live": jobs.slots.live, "of": jobs.slots.count}
+        if not jobs.slots.live:
+            raise Problem("unavailable", "no slot for jobs lives; they are started again", headers={"Retry-After": "2"})
+        return JSONResponse({"status": "ready", "slots": slots, "confinement": jobs.source.report})
 
     @app.get("/metrics", summary="For Prometheus", response_class=Response)
     async def prometheus() -> Response:

@@ -104,8 +104,12 @@ async def _read_form(request: Request, model: type[StageOnly], limits: Limits, f
 def _store(stage: UploadFile, path: Path, most: int) -> None:
     if (stage.size or 0) > most:
         raise Problem("too-large", f"the stage has {stage.size} bytes; the limit is {most}")
-    with open(path, "xb") as file:
-        shutil.copyfileobj(stage.file, file, 1 << 20)
+    try:
+        with open(path, "xb") as file:
+            shutil.copyfileobj(stage.file, file, 1 << 20)
+    except OSError:  # of a full disk
+        path.unlink(missing_ok=True)
+        raise
 
 
 def _suffix(start: bytes) -> str:

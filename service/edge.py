@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import re
-import secrets
 import time
 from collections.abc import Sequence
 
@@ -13,6 +12,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from .hosts import Door
+from .journal import request_id
 from .metrics import Metrics
 from .problems import MEDIA_TYPE, Problem, of_status, respond
 from .shares import Client, address_of
@@ -40,7 +40,7 @@ class Edge:
         headers = Headers(scope=scope)
         unread = headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
         expects = headers.get("expect", "").lower() == "100-continue"
-        identifier = secrets.token_hex(8)
+        identifier = request_id(headers.get("x-request-id"))
         state = scope.setdefault("state", {})
         state["request_id"] = identifier
         state["client"] = Client(address_of((scope.get("client") or ("",))[0]))

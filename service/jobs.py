@@ -11,7 +11,7 @@ import math
 import os
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -19,12 +19,16 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from .digests import engine
+from .bodies import own_stage
+from .digests import engine, file_digest, tree_digest
+from .discreet import own_folders, without_folders
 from .limits import Limits
 from .metrics import Metrics
 from .pool import Source, Worker
 from .problems import KINDS, Problem
 from .shares import NOBODY, Client, Shares
+from .shortage import problem_of
+from .slots import Ready, Slots
 from .store import Record, Store, now
 
 log = logging.getLogger("refract.service")
@@ -73,26 +77,59 @@ class Jobs:
         self._kept: set[str] = set()
         self._news: dict[str, asyncio.Event] = {}
         self._tasks: list[asyncio.Task[None]] = []
+        self._hidden = {*own_folders(), str(store.jobs.parent), *([str(stage_root)] if stage_root else ())}
+        self.slots = Slots(workers, self._one, metrics)
+        self._unsaved: set[str] = set()
+        """Jobs whose end could not be written down yet."""
 
     # --- life -------------------------------------------------------------------------------------------------------
 
     def start(self) -> None:
         self.source.start()
-        self._tasks = [asyncio.create_task(self._slot()) for _ in range(self.workers)]
-        self._tasks.append(asyncio.create_task(self._sweep()))
+        self._tasks = [*self.slots.start(), asyncio.create_task(self._sweep()), asyncio.create_task(self._resume())]
 
     async def stop(self) -> None:
-        """Let what is under way finish, for a while."""
+        """Let what is under way finish, for a while. What still waits then and is kept waits for the next start."""
         self.draining = True
         deadline = time.monotonic() + self.limits.drain_seconds
         while self._active and time.monotonic() < deadline:
             await asyncio.sleep(0.05)
-        for identifier in list(self._active):
-            self._end(self.records[identifier], "failed", Problem("interrupted", "the service was stopped"))
+        for record in [self.records[identifier] for identifier in self._active]:
+            if not (record.kept and record.status == "queued"):
+                self._end(record, "failed", Problem("interrupted", "the service was stopped"))
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         await self.source.stop()
+
+    async def _resume(self) -> None:
+        """Queue what waited when the service ended, unless it would not be the same job any more."""
+        for record in [one for one in self.records.values() if one.status == "queued" and one.id not in self._active]:
+            try:
+                same = await asyncio.to_thread(self._identity_now, record) == record.id
+            except (OSError, Problem):  # the stage is gone, or half of it is
+                same = False
+            if record.ended:
+                continue
+            self._active.add(record.id)
+            if not same:
+                text = "the service ended while the job was waiting, and its stage is not there any more"
+                self._end(record, "failed", Problem("interrupted", text))
+                continue
+            record.created = now()  # the time it may wait begins anew
+            self._kept.add(record.id)
+            self._count()
+            self.shares.enter(record, Client("", record.owner))
+
+    def _identity_now(self, record: Record) -> str:
+        """What the id of a job would be if it came in now."""
+        if record.uploaded:
+            digest = file_digest(self.store.folder(record.id) / record.stage)
+        else:
+            if self.stage_root is None or own_stage(self.stage_root, record.stage) != record.stage:
+                return ""
+            digest = tree_digest(self.stage_root, record.stage)
+        return _identity(record.kind, digest, record.settings, record.owner)
 
     # --- in ---------------------------------------------------------------------------------------------------------
 
@@ -118,10 +155,7 @@ class Jobs:
         Raises:
             Problem: there is no place for another job, or not for this client.
         """
-        # Each owner has jobs of its own: that somebody else has asked for the same is nobody's business.
-        owner = [client.owner] if client.owner else []
-        wish = json.dumps([kind, engine(), digest, settings, *owner], sort_keys=True, allow_nan=False)
-        identifier = hashlib.sha256(wish.encode()).hexdigest()
+        identifier = _identity(kind, digest, settings, client.owner)
         known = self.records.get(identifier)
         if known and known.status in ("queued", "running", "done"):
             self.metrics.cached.inc()
@@ -129,9 +163,13 @@ class Jobs:
         self.shares.check(client)
         self.store.remove(identifier)
         record = Record(identifier, kind, settings, stage, upload is not None, owner=client.owner)
-        self.store.save(record)
-        if upload:
-            os.replace(upload, self.store.folder(identifier) / stage)
+        try:
+            self.store.save(record)
+            if upload:
+                os.replace(upload, self.store.folder(identifier) / stage)
+        except OSError:
+            self.store.remove(identifier)
+            raise
         self._kept.discard(identifier)
         self.records[identifier] = record
         self._active.add(identifier)
@@ -142,8 +180,12 @@ class Jobs:
     # --- listening --------------------------------------------------------------------------------------------------
 
     def keep(self, record: Record) -> None:
-        """Finish this job even if nobody waits for it."""
+        """Finish this job even if nobody waits for it, and after a restart of the service if need be."""
         self._kept.add(record.id)
+        if not record.kept and record.status == "queued":
+            record.kept = True
+            with contextlib.suppress(OSError):  # of a full disk: after a restart it is told as interrupted
+                self.store.save(record)
 
     @contextlib.asynccontextmanager
     async def waiting(self, record: Record) -> AsyncIterator[None]:
@@ -182,26 +224,39 @@ class Jobs:
 
     # --- work -------------------------------------------------------------------------------------------------------
 
-    async def _slot(self) -> None:
-        """One worker after the other, each made before there is a job for it."""
-        while True:
-            worker, work = await self.source.fork(), self.store.new_work()
-            record = None
+    async def _one(self, ready: Ready) -> None:
+        """One job, by a worker that is made before there is a job for it."""
+        worker = await self.source.fork()
+        try:
+            work = self.store.new_work()
+        except BaseException:
+            await self._dismiss(worker)
+            raise
+        ready()
+        record = None
+        try:
+            while record is None or record.ended:
+                record = self.records.get(await self._line.get())
+            worker = await self._begin(record, worker, work)
+            await self._run(record, worker, work)
+        except Exception as error:
+            log.exception("a job failed in the server")
+            if record is not None and not record.ended:
+                problem = problem_of(error) or Problem("internal", "the service could not do this job")
+                self._end(record, "failed", problem)
+        finally:
+            if record is not None:
+                worker = self._given.pop(id(record), worker)
             try:
-                while record is None or record.ended:
-                    record = self.records.get(await self._line.get())
-                worker = await self._begin(record, worker, work)
-                await self._run(record, worker, work)
-            except Exception:
-                log.exception("a job failed in the server")
-                if record is not None and not record.ended:
-                    self._end(record, "failed", Problem("internal", "the service could not do this job"))
+                await self._dismiss(worker)
             finally:
-                if record is not None:
-                    self._given.pop(id(record), None)
-                await self.source.kill(worker)
-                worker.close()
                 self.store.drop_work(work)
+
+    async def _dismiss(self, worker: Worker) -> None:
+        try:
+            await self.source.kill(worker)
+        finally:
+            worker.close()
 
     async def _begin(self, record: Record, worker: Worker, work: Path) -> Worker:
         """Give a job to a worker; to another one where it ended while it waited, which is not the job's fault."""
@@ -214,13 +269,16 @@ class Jobs:
             "kind": record.kind, "stage": record.stage, "root": str(root), "folder": str(work),
             "settings": {**record.settings, "threads": threads}, "limits": asdict(self.limits),
         }  # fmt: skip
+        wait = 0.0
         while True:
             self._given[id(record)] = worker
             with contextlib.suppress(ConnectionError):
                 await worker.give(order)
                 if await worker.hear() == {"began": True} or record.ended:
                     return worker
-            worker.close()
+            await self._dismiss(worker)
+            await asyncio.sleep(wait)
+            wait = min(2 * wait + 0.05, 2.0)
             worker = await self.source.fork()
 
     async def _run(self, record: Record, worker: Worker, work: Path) -> None:
@@ -260,7 +318,7 @@ class Jobs:
         done: dict[str, Any] | None = None
         while message := await worker.hear():
             if "problem" in message:
-                return _problem_of(message["problem"])
+                return self._problem_of(record, message["problem"], work)
             if "done" in message:
                 done = message["done"]
                 break
@@ -280,15 +338,29 @@ class Jobs:
         self.metrics.crashes.inc()
         return _crash_of(record, code, work)
 
+    def _discreet(self, text: Any) -> str:
+        return without_folders(str(text)[:10_000], self._hidden)
+
+    def _problem_of(self, record: Record, message: Any, work: Path) -> Problem:
+        """A worker's own words, with what only the server can know about them."""
+        problem = _problem_of(message, self._discreet)
+        if problem.slug == "worker-fault":
+            self.metrics.faults.inc()
+            log.error("job %s: a fault of this program\n%s", record.id, _last_words(work))
+        if problem.slug == "no-space" and self.store.free() > self.limits.result_bytes:
+            return Problem("limit-exceeded", "the files of the job are larger than this service allows")
+        return problem
+
     def _progress(self, record: Record, message: dict[str, Any]) -> None:
         if isinstance(message.get("progress"), int | float) and math.isfinite(message["progress"]):
             fraction = round(min(max(float(message["progress"]), record.fraction), 1.0), 4)
-            step = (fraction, str(message.get("stage", ""))[:200])
+            step = (fraction, self._discreet(message.get("stage", ""))[:200])
             if step[1] == record.stage_of_work and fraction - record.fraction < 0.01:
                 return
             record.fraction, record.stage_of_work = step
         elif "warning" in message and len(record.warnings) < self.limits.warnings:
-            record.warnings.append({"path": str(message.get("path"))[:500], "text": str(message["warning"])[:500]})
+            path, text = (self._discreet(message.get(name))[:500] for name in ("path", "warning"))
+            record.warnings.append({"path": path, "text": text})
         self._tell(record)
 
     def _end(self, record: Record, status: str, problem: Problem | None) -> None:
@@ -301,10 +373,19 @@ class Jobs:
         self.shares.ended(record)
         self._count()
         self.metrics.jobs.labels(record.kind, problem.slug if problem else status).inc()
-        with contextlib.suppress(OSError):
-            self.store.drop_stage(record)
-            self.store.save(record)
+        self._unsaved.add(record.id)
+        self._save_ends()
         self._tell(record)
+
+    def _save_ends(self) -> None:
+        """Write down how jobs ended; where the disk is full, when there is room again."""
+        for identifier in list(self._unsaved):
+            with contextlib.suppress(OSError):
+                record = self.records.get(identifier)
+                if record is not None and record.ended:
+                    self.store.drop_stage(record)
+                    self.store.save(record)
+                self._unsaved.discard(identifier)
 
     def _count(self) -> None:
         self.metrics.running.set(len(self._running))
@@ -317,11 +398,14 @@ class Jobs:
             await asyncio.sleep(_SWEEP)
             try:
                 self.sweep()
-            except OSError:
+            except Exception:  # the next round may do better; without any, the disk would fill
                 log.exception("old jobs could not be removed")
 
     def sweep(self) -> None:
         """End jobs that have waited too long; remove results that are too old, or too much."""
+        with contextlib.suppress(OSError):  # the rest of this makes room
+            self.store.drop_leavings()
+        self._save_ends()
         longest = timedelta(seconds=self.limits.queue_seconds)
         for identifier in list(self._active):
             record = self.records[identifier]
@@ -340,23 +424,33 @@ class Jobs:
                 self._kept.discard(record.id)
 
 
-def _problem_of(message: Any) -> Problem:
+def _problem_of(message: Any, discreet: Callable[[Any], str]) -> Problem:
     """A worker's own words, if they are in order."""
     if isinstance(message, dict) and message.get("slug") in KINDS and isinstance(message.get("detail"), str):
         errors = [
-            {"pointer": str(one.get("pointer"))[:1100], "detail": str(one.get("detail"))[:500]}
+            {"pointer": discreet(one.get("pointer"))[:1100], "detail": discreet(one.get("detail"))[:500]}
             for one in message.get("errors") or [] if isinstance(one, dict)
         ]  # fmt: skip
-        return Problem(message["slug"], message["detail"][:1000], errors=errors[:20],
-                       prim=str(message.get("prim") or "")[:1024])  # fmt: skip
+        return Problem(message["slug"], discreet(message["detail"])[:1000], errors=errors[:20],
+                       prim=discreet(message.get("prim") or "")[:1024])  # fmt: skip
     return Problem("stage-crashed", "the worker ended without an answer")
+
+
+def _identity(kind: str, digest: str, settings: dict[str, Any], owner: str) -> str:
+    # Each owner has jobs of its own: that somebody else has asked for the same is nobody's business.
+    wish = json.dumps([kind, engine(), digest, settings, *([owner] if owner else [])], sort_keys=True, allow_nan=False)
+    return hashlib.sha256(wish.encode()).hexdigest()
+
+
+def _last_words(work: Path) -> str:
+    with contextlib.suppress(OSError):
+        return (work / "worker.log").read_text("utf-8", "replace")[-4000:]
+    return ""
 
 
 def _crash_of(record: Record, code: int, work: Path) -> Problem:
     """What the end of a worker means to the client; its last words are for the log alone."""
-    said = ""
-    with contextlib.suppress(OSError):
-        said = (work / "worker.log").read_text("utf-8", "replace")[-4000:]
+    said = _last_words(work)
     log.warning("job %s: worker ended with %d\n%s", record.id, code, said)
     if code in (-24, -25) or (code == -9 and "CPU" in said):
         return Problem("time-limit", "the job used more processor time than this service allows")

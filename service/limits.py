@@ -28,6 +28,7 @@ class Limits:
     body_seconds: int = _limit(30, "s", "time for a request's body to arrive")
     bodies: int = _limit(32, "bodies", "bodies of requests that arrive at once")
     header_seconds: int = _limit(10, "s", "time for a request's head to arrive")
+    connections: int = _limit(1000, "connections", "open at once; fewer where the process may open too few files")
     settings_bytes: int = _limit(256 << 10, "bytes", "settings of one request, as JSON")
     stage_bytes: int = _limit(64 << 20, "bytes", "one uploaded stage, and what its package holds when unpacked")
     layers: int = _limit(256, "files", "layers that one stage is composed of")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
@@ -14,6 +14,7 @@ class Metrics:
 
     def __init__(self) -> None:
         self.registry = registry = CollectorRegistry()
+        ProcessCollector(registry=registry)
         self.requests = Counter("refract_requests_total", "Answers", ["route", "status"], registry=registry)
         self.jobs = Counter("refract_jobs_total", "Jobs that ended", ["kind", "outcome"], registry=registry)
         self.cached = Counter("refract_jobs_reused_total", "Requests answered by a job there was", registry=registry)
@@ -25,6 +26,15 @@ class Metrics:
         self.worked = Histogram(
             "refract_work_seconds", "From start to end", ["kind"], registry=registry, buckets=_SECONDS
         )
+        self.connections = Gauge("refract_connections", "Connections that are open", registry=registry)
+        self.refused = Counter(
+            "refract_connections_refused_total", "Connections closed for lack of places", ["why"], registry=registry
+        )
+        self.slots = Gauge("refract_slots", "Places for one job each", ["state"], registry=registry)
+        self.slot_failures = Counter(
+            "refract_slot_failures_total", "Slots that got no worker and were started again", registry=registry
+        )
+        self.faults = Counter("refract_worker_faults_total", "Jobs that met a fault of ours", registry=registry)
         self.crashes = Counter("refract_worker_crashes_total", "Workers that ended on their own", registry=registry)
 
     def text(self) -> bytes:

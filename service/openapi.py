@@ -16,7 +16,7 @@ _PROBLEM = {"$ref": "#/components/schemas/ProblemDocument"}
 _TOKEN = "token"
 ALWAYS = (400, 421, 431, 500)
 """Problems that any request can meet."""
-WORK = (403, 406, 408, 409, 413, 415, 422, 429, 501, 503)
+WORK = (403, 406, 408, 409, 413, 415, 422, 429, 501, 503, 507)
 """Problems of a request that becomes a job, and of the job."""
 
 
@@ -31,6 +31,7 @@ _HEADERS_OF: dict[int, dict[str, Any]] = {
     416: {"Content-Range": _header("size of the result in bytes", example="bytes */1951")},
     429: {"Retry-After": _header("seconds after which to try again", "integer")},
     503: {"Retry-After": _header("seconds after which to try again", "integer")},
+    507: {"Retry-After": _header("seconds after which to try again", "integer")},
 }
 _RESULT_HEADERS = {
     "ETag": _header("strong; the same for the same stage, settings and engine"),

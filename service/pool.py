@@ -115,7 +115,8 @@ class Nursery:
             try:
                 await self._run()
                 log.warning("the process that forks workers has ended; it is started anew")
-            except Exception:  # whatever keeps it from starting may pass
+            except Exception as error:  # whatever keeps it from starting may pass
+                wait = min(wait, 2.0) if isinstance(error, OSError) else wait
                 log.exception("the process that forks workers cannot be started; trying again in %.1f s", wait)
             finally:
                 self.ready.clear()
@@ -173,7 +174,11 @@ class Nursery:
                     ours.close()
                     await asyncio.sleep(0.1)
                     continue
-            reader, writer = await asyncio.open_connection(sock=ours, limit=_LINE)
+            try:
+                reader, writer = await asyncio.open_connection(sock=ours, limit=_LINE)
+            except BaseException:
+                ours.close()  # which ends the worker too
+                raise
             worker = Child(reader, writer, identifier)
             self._workers[identifier] = worker
             return worker

@@ -51,9 +51,13 @@ KINDS: dict[str, Kind] = {
                         "says how much."),
     "head-too-large": Kind(431, "The head of the request is too large", "Send fewer or shorter headers."),
     "internal": Kind(500, "Something went wrong in the service", "Tell whoever runs it the request's id."),
+    "worker-fault": Kind(500, "The job met a fault of this program",
+                         "The stage may be in order: the program failed where it should have drawn it, or told what is "
+                         "wrong. Whoever runs the service has the reason in its log, under the job's id."),
     "transfer-coding": Kind(501, "The transfer coding is not known", "Send Content-Length, or chunks."),
     "interrupted": Kind(503, "The service stopped before the job was done", "Send the request again."),
     "unavailable": Kind(503, "The service takes no jobs now", "Try again after the time in Retry-After."),
+    "no-space": Kind(507, "The service has no room left", "Try again after the time in Retry-After."),
 }  # fmt: skip
 
 BY_STATUS = {404: "not-found", 405: "method-not-allowed", 413: "too-large", 415: "unsupported-media-type",
@@ -102,6 +106,6 @@ def document_response(document: dict[str, Any], headers: dict[str, str] | None =
     extra = {"Cache-Control": "no-store", **(headers or {})}
     if document["status"] == 401:
         extra["WWW-Authenticate"] = "Bearer"
-    if document["status"] in (429, 503):
+    if document["status"] in (429, 503, 507):
         extra.setdefault("Retry-After", "5")
     return Response(content, document["status"], extra, MEDIA_TYPE)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import socket
 import sys
 from dataclasses import replace
@@ -20,26 +19,36 @@ from refract_core.errors import UsageError
 
 from .app import Settings, create_app
 from .edge import GUARDS
+from .gate import Gate, fitting
+from .journal import listen
 from .problems import Problem, of_status, respond
 
+_AT_ONCE, _BACKLOG = 32, 1024
+"""Connections that asyncio takes in before the gate sees the first of them, and those that the system keeps for it."""
 _LINGER = 1.0
 """[s] What a client still sends after an error is read and thrown away for this long: if the connection closed at
 once, its system would drop the answer."""
 
 
-def serve(settings: Settings, host: str, port: int) -> None:
+def serve(settings: Settings, host: str, port: int, log: str = "auto") -> None:
     """Run until SIGTERM or Ctrl-C; then refuse new work and let running jobs finish for a while.
+
+    Args:
+        log: one of `journal.KINDS`.
 
     Raises:
         UsageError: the address cannot be used.
     """
-    app = create_app(replace(settings, host=host))
+    listen(log)
+    settings = replace(settings, host=host, limits=fitting(settings.limits, settings.workers))
+    app = create_app(settings)
+    gate = Gate(settings.limits.connections, app.state.metrics)
     config = uvicorn.Config(
-        app, host=host, port=port, http=_patient(settings.limits.header_seconds), ws="none", lifespan="on",
+        app, host=host, port=port, http=_patient(settings.limits.header_seconds, gate), ws="none", lifespan="on",
         timeout_keep_alive=15, timeout_graceful_shutdown=settings.limits.drain_seconds, server_header=False,
-        log_level="warning", access_log=False, proxy_headers=False,  # `create_app` has those
+        log_config=None, access_log=False, backlog=_AT_ONCE, loop="asyncio",
+        proxy_headers=False,  # `create_app` has those
     )  # fmt: skip
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     # With the protocol named, asyncio switches Nagle's delay off; else each answer would take 40 ms more.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
@@ -55,14 +64,19 @@ def serve(settings: Settings, host: str, port: int) -> None:
 
 
 class _Server(uvicorn.Server):
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        for listener in sockets or ():
+            listener.listen(_BACKLOG)
+
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         self.config.app.state.jobs.draining = True  # type: ignore[union-attr]
         super().handle_exit(sig, frame)
 
 
-def _patient(seconds: float) -> type[H11Protocol]:
-    """uvicorn's own protocol, which ends a connection that does not get to the end of a head in time, and answers what
-    is not HTTP with a problem document too."""
+def _patient(seconds: float, gate: Gate) -> type[H11Protocol]:
+    """uvicorn's own protocol, which ends a connection that does not get to the end of a head in time or finds no place,
+    and answers what is not HTTP with a problem document too."""
 
     class Patient(H11Protocol):
         _giving_up: asyncio.TimerHandle | None = None
@@ -70,7 +84,15 @@ def _patient(seconds: float) -> type[H11Protocol]:
 
         def connection_made(self, transport: Any) -> None:
             super().connection_made(transport)
-            self._watch()
+            if gate.enter(self):
+                self._watch()
+            else:
+                text = "too many connections are open"
+                self._refuse(Problem("unavailable", text, headers={"Retry-After": "2"}))
+
+        def leave(self) -> None:
+            self._refused = True
+            self.transport.abort()
 
         def data_received(self, data: bytes) -> None:
             if not self._refused:
@@ -79,9 +101,13 @@ def _patient(seconds: float) -> type[H11Protocol]:
 
         def send_400_response(self, msg: str) -> None:
             """uvicorn calls this where h11 cannot read on: in a head, or in the chunks of a body."""
-            self._refused = True
             status = getattr(sys.exception(), "error_status_hint", 400)
-            answer = respond(of_status(status) if status != 400 else Problem("bad-request", "this is no HTTP/1.1"))
+            self._refuse(of_status(status) if status != 400 else Problem("bad-request", "this is no HTTP/1.1"))
+
+        def _refuse(self, problem: Problem) -> None:
+            """Answer without having read a request, and close."""
+            self._refused = True
+            answer = respond(problem)
             begun = self.conn.our_state not in (h11.IDLE, h11.SEND_RESPONSE)
             if self.cycle is not None and not self.cycle.response_complete:  # its body ends here
                 self.cycle.disconnected = True
@@ -103,12 +129,23 @@ def _patient(seconds: float) -> type[H11Protocol]:
         def _write(self, event: h11.Event) -> None:
             self.transport.write(self.conn.send(event) or b"")
 
+        def on_response_complete(self) -> None:
+            super().on_response_complete()
+            if not self._busy():
+                gate.waits(self)
+
+        def _busy(self) -> bool:
+            return self.cycle is not None and not self.cycle.response_complete
+
         def _watch(self) -> None:
-            busy = self.cycle is not None and not self.cycle.response_complete
+            busy = self._busy()
+            if busy:
+                gate.works(self)
             if busy and self._giving_up:
                 self._giving_up.cancel()
                 self._giving_up = None
             elif not busy and not self._giving_up:
+                gate.waits(self)
                 self._giving_up = self.loop.call_later(seconds, self._give_up)
 
         def _give_up(self) -> None:
@@ -119,6 +156,7 @@ def _patient(seconds: float) -> type[H11Protocol]:
         def connection_lost(self, exc: Exception | None) -> None:
             if self._giving_up:
                 self._giving_up.cancel()
+            gate.gone(self)
             super().connection_lost(exc)
 
     return Patient

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -9,6 +10,7 @@ import secrets
 import shutil
 import stat
 import tempfile
+import time
 from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,6 +21,10 @@ from .problems import Problem
 ENDED = ("done", "failed", "cancelled")
 RESULTS = re.compile(r"^(image\.(png|exr)|aov\.[A-Za-z_.]+\.png|report\.json|converted\.usdz)$")
 _ID = re.compile(r"^[0-9a-f]{64}$")
+_FORGOTTEN = 3600.0  # [s]
+_FILES_OF_JOB, _BYTES_OF_JOB = 32, 1 << 20
+"""The least that must be left for the service to call itself ready; a job may need far more."""
+_WORK = re.compile(r"^[0-9a-f]{16}$")
 
 
 def now() -> str:
@@ -35,6 +41,8 @@ class Record:
     stage: str
     """Name of the uploaded file in the job's folder, or the path of a stage under the stage root."""
     uploaded: bool
+    kept: bool = False
+    """It is to be finished even if nobody waits for it."""
     status: str = "queued"
     fraction: float = 0.0
     stage_of_work: str = "waiting"
@@ -70,8 +78,12 @@ class Record:
 def make_work(parent: Path) -> Path:
     """A worker's folder: what comes in, what goes out, and scratch."""
     folder = parent / secrets.token_hex(8)
-    for part in ("in", "out", "tmp"):
-        (folder / part).mkdir(parents=True, mode=0o700)
+    try:
+        for part in ("in", "out", "tmp"):
+            (folder / part).mkdir(parents=True, mode=0o700)
+    except OSError:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
     return folder
 
 
@@ -83,6 +95,8 @@ class Store:
         self.jobs.mkdir(parents=True, exist_ok=True, mode=0o700)
         shutil.rmtree(self.work, ignore_errors=True)  # of workers that are gone
         self.work.mkdir(mode=0o700)
+        self._given: set[Path] = set()
+        """Workers' folders in use."""
 
     def folder(self, identifier: str) -> Path:
         return self.jobs / identifier
@@ -91,11 +105,16 @@ class Store:
         folder = self.folder(record.id)
         folder.mkdir(exist_ok=True, mode=0o700)
         temporary = folder / f".{secrets.token_hex(4)}"
-        temporary.write_text(json.dumps(asdict(record), allow_nan=False), "utf-8")
-        os.replace(temporary, folder / "record.json")
+        try:
+            temporary.write_text(json.dumps(asdict(record), allow_nan=False), "utf-8")
+            os.replace(temporary, folder / "record.json")
+        except OSError:
+            temporary.unlink(missing_ok=True)
+            raise
 
     def load_all(self) -> dict[str, Record]:
-        """Every job there is; those that were under way when the service ended have failed."""
+        """Every job there is. Those that were under way when the service ended have failed; those that only waited,
+        and are to be finished, still wait."""
         found: dict[str, Record] = {}
         known = {one.name for one in fields(Record)}
         for folder in sorted(self.jobs.iterdir()):
@@ -108,12 +127,14 @@ class Store:
             if not _ID.match(record.id) or record.id != folder.name:
                 shutil.rmtree(folder, ignore_errors=True)
                 continue
-            if not record.ended:
+            if not record.ended and not (record.kept and record.status == "queued"):
                 problem = Problem("interrupted", "the service ended while the job was waiting or running")
                 record.status, record.finished = "failed", now()
                 record.problem = problem.document(f"/v1/jobs/{record.id}")
-                self.save(record)
                 self.drop_stage(record)
+                self.drop_results(record)
+                with contextlib.suppress(OSError):  # of a full disk; it is told all the same
+                    self.save(record)
             found[record.id] = record
         return found
 
@@ -128,8 +149,17 @@ class Store:
     def size(self, identifier: str) -> int:
         return sum(entry.stat().st_size for entry in os.scandir(self.folder(identifier)) if entry.is_file())
 
+    def free(self) -> int:
+        """Room for further files [bytes]; 0 where there are fewer files left to make than a job needs."""
+        found = os.statvfs(self.work)
+        enough = found.f_favail >= _FILES_OF_JOB or not found.f_files  # some file systems do not count them
+        return found.f_bavail * found.f_frsize if enough else 0
+
     def writable(self) -> bool:
+        """Whether there is room for the least that a job writes."""
         try:
+            if self.free() < _BYTES_OF_JOB:
+                return False
             with tempfile.TemporaryFile(dir=self.work) as file:
                 file.write(b"x")
         except OSError:
@@ -139,13 +169,35 @@ class Store:
     # --- a worker's folder ------------------------------------------------------------------------------------------
 
     def new_work(self) -> Path:
-        return make_work(self.work)
+        work = make_work(self.work)
+        self._given.add(work)
+        return work
 
     def take_results(self, work: Path, record: Record) -> None:
-        """Move what a worker wrote into the job's folder: plain files of known names, nothing else."""
-        for entry in os.scandir(work / "out"):
-            if RESULTS.match(entry.name) and stat.S_ISREG(entry.stat(follow_symlinks=False).st_mode):
-                os.replace(entry.path, self.folder(record.id) / entry.name)
+        """Move what a worker wrote into the job's folder: plain files of known names, nothing else, and all or none."""
+        try:
+            for entry in os.scandir(work / "out"):
+                if RESULTS.match(entry.name) and stat.S_ISREG(entry.stat(follow_symlinks=False).st_mode):
+                    os.replace(entry.path, self.folder(record.id) / entry.name)
+        except OSError:
+            with contextlib.suppress(OSError):
+                self.drop_results(record)
+            raise
+
+    def drop_results(self, record: Record) -> None:
+        for path in self.folder(record.id).iterdir():
+            if RESULTS.match(path.name):
+                path.unlink(missing_ok=True)
 
     def drop_work(self, work: Path) -> None:
         shutil.rmtree(work, ignore_errors=True)
+        self._given.discard(work)
+
+    def drop_leavings(self) -> None:
+        """Remove workers' folders that could not be removed at once, such as when no descriptor was free for it, and
+        uploads that nobody has fetched for an hour."""
+        for path in self.work.iterdir():
+            if _WORK.match(path.name) and path not in self._given:
+                shutil.rmtree(path, ignore_errors=True)
+            elif path.name.startswith("upload-") and time.time() - path.stat().st_mtime > _FORGOTTEN:
+                shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)

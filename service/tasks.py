@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-import refract_core
 from refract_core.errors import EmbreeError, ImageError, RefractError, SceneError, StageError, UsageError
 from refract_core.images.aovs import AOVS
 from refract_core.scene import Notice, Scene
 from refract_core.verbs.override import OverrideError, Overrides, override, override_notes
 
+from .discreet import own_folders, own_places, without_folders
 from .problems import Problem
 
 Say = Callable[..., None]
@@ -55,6 +55,9 @@ def perform(kind: str, stage: str, out: str, settings: Mapping[str, Any], limits
                           errors=[{"pointer": "/camera", "detail": "the stage has no such camera"}]) from None
         raise Problem("invalid-settings", _public(str(error))) from None
     except (SceneError, ImageError) as error:
+        if "cannot be encoded" in str(error):  # a picture of ours, not of the stage
+            text = "a picture of this size and form is larger than this service or its format allows"
+            raise Problem("limit-exceeded", text) from error
         raise Problem("stage-invalid", _public(str(error))) from None
     except EmbreeError as error:
         slug = "memory-limit" if "memory" in str(error) else "stage-invalid"
@@ -71,11 +74,7 @@ def _public(text: str) -> str:
     if text.startswith("USD says:"):
         return "USD warned about this stage; `refract render` on it shows what it said"
     text = re.sub(_QUOTES, "", text).strip()
-    for folder in sorted({os.getcwd(), os.path.realpath("."), os.path.dirname(os.getcwd())}, key=len, reverse=True):
-        text = text.replace(folder + os.sep, "")
-    for known in (os.path.expanduser("~"), os.path.dirname(os.path.dirname(refract_core.__file__))):
-        text = text.replace(known, "")
-    return text[:500]
+    return without_folders(text, {*own_folders(), *own_places()})[:500]
 
 
 def _tell(notices: tuple[Notice, ...] | list[Notice], say: Say, limits: Mapping[str, int]) -> None:

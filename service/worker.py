@@ -44,7 +44,9 @@ def environment() -> dict[str, str]:
 def main() -> None:
     confine.die_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the server's to handle
-    control = socket.socket(fileno=int(sys.argv[1]))
+    given = int(sys.argv[1])
+    control = socket.socket(fileno=os.dup(given))  # a low number: the server may have a thousand others open
+    os.close(given)
     os.dup2(2, 1)  # libraries print
     threads = _warm()
     _send(control, {"ready": {**confine.available(), "threads": threads}})
@@ -107,12 +109,18 @@ def _obey(control: socket.socket, children: dict[int, tuple[str, socket.socket]]
                 os.kill(pid, signal.SIGKILL)
         return True
     parent = os.getpid()
-    pid = os.fork()
+    try:
+        place, pid = descriptors[0], os.fork()
+    except (IndexError, OSError):  # no descriptor or no process is left; the server asks again
+        for descriptor in descriptors:
+            os.close(descriptor)
+        _send(control, {"ended": message["fork"], "code": -9})
+        return True
     if pid == 0:
         signal.set_wakeup_fd(-1)
         control.close()
-        _child(descriptors[0], parent)
-    os.close(descriptors[0])
+        _child(place, parent)
+    os.close(place)
     children[pid] = (message["fork"], control)
     return True
 
@@ -150,15 +158,21 @@ def _serve(descriptor: int) -> int:
             data = data[os.write(descriptor, data) :]
 
     from .problems import Problem
+    from .shortage import problem_of_job
 
     try:
         say(done=_perform(job, say))
-    except Problem as problem:
+    except Problem as told:
+        problem = problem_of_job(told) or told  # a full disk is no fault of the stage
         say(problem={"slug": problem.slug, "detail": problem.detail, "errors": problem.errors, "prim": problem.prim})
     except UnicodeDecodeError:  # what USD says of a damaged file may hold pieces of it
         say(problem={"slug": "stage-invalid", "detail": "the stage cannot be read as USD", "errors": [], "prim": ""})
     except MemoryError:
         say(problem={"slug": "memory-limit", "detail": "the job ran out of memory", "errors": [], "prim": ""})
+    except Exception as error:
+        traceback.print_exc()  # to the job's own log
+        problem = problem_of_job(error) or Problem("worker-fault", "the program failed on this stage")
+        say(problem={"slug": problem.slug, "detail": problem.detail, "errors": [], "prim": ""})
     return 0
 
 

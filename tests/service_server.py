@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -133,11 +133,17 @@ def until(true: Any, seconds: float = PATIENCE) -> None:
 
 @contextmanager
 def running(
-    data: Path, *words: str, environment: dict[str, str] | None = None, own_data: bool = True
-) -> Iterator[Server]:
-    """Start the service as a user would, and stop it. `own_data`: `data` is its folder, else it makes one itself."""
+    data: Path, *words: str, environment: dict[str, str] | None = None, own_data: bool = True,
+    within: Sequence[str] = (),
+) -> Iterator[Server]:  # fmt: skip
+    """Start the service as a user would, and stop it.
+
+    Args:
+        own_data: `data` is its folder, else it makes one itself.
+        within: words before the command, of a program that changes its surroundings and becomes the service.
+    """
     folder = ("--data", str(data)) if own_data else ()
-    command = [sys.executable, "-m", "refract_core.cli", "serve", "--port", "0", *folder, *words]
+    command = [*within, sys.executable, "-m", "refract_core.cli", "serve", "--port", "0", *folder, *words]
     log = data.parent / f"{data.name}.log"
     with open(log, "w") as errors:
         variables = {**os.environ, **(environment or {})}

@@ -194,7 +194,7 @@ def test_the_kill_of_a_worker_fails_one_job(client: httpx.Client, server: Server
         kill(pid)
     until(lambda: client.get(where).json()["status"] == "failed")
     assert client.get(where).json()["problem"]["type"] == "/problems/stage-crashed"
-    assert where.rpartition("/")[2] in server.log.read_text()
+    assert f"job {where.rpartition('/')[2]}: worker ended with -9" in server.log.read_text()
     assert post(client).status_code == 200
 
 

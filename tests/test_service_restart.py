@@ -23,6 +23,10 @@ def test_results_survive_a_restart_and_orphans_have_failed(tmp_path: Path) -> No
         picture = client.post("/v1/render", json={"stage": "traced.usda", **SMALL})
         orphan = client.post("/v1/render", json=LONG, headers={"Prefer": "respond-async"}).headers["location"]
         until(lambda: client.get(orphan).json()["status"] == "running")
+        later = {"Prefer": "respond-async"}
+        ours = client.post("/v1/render", json={"stage": "traced.usda", **SMALL, "exposure": 0.5}, headers=later)
+        theirs = client.post("/v1/render", files=upload(BALL), headers=later)
+        waiting = [ours.headers["location"], theirs.headers["location"]]
         family = [server.nursery(), *server.workers()]
         os.kill(server.process.pid, signal.SIGKILL)
         server.process.wait()
@@ -32,6 +36,9 @@ def test_results_survive_a_restart_and_orphans_have_failed(tmp_path: Path) -> No
         assert client.get(f"{where}/image").content == picture.content
         job = client.get(orphan).json()
         assert (job["status"], job["problem"]["type"]) == ("failed", "/problems/interrupted")
+        for place in waiting:  # what had not begun is done
+            until(lambda place=place: client.get(place).json()["status"] == "done")
+            assert client.get(f"{place}/image").headers["content-type"] == "image/png"
         # a stop lets what runs finish
         accepted = client.post("/v1/render", json=SECONDS, headers={"Prefer": "respond-async"})
         until(lambda: client.get(accepted.headers["location"]).json()["status"] != "queued")

@@ -89,6 +89,15 @@ Limit = Annotated[
         "environment does it too: REFRACT_LIMIT_JOB_SECONDS=60.",
     ),
 ]
+Log = Annotated[
+    str,
+    typer.Option(
+        metavar="KIND",
+        envvar="REFRACT_LOG",
+        help="Form of the log on stderr, which has a line for each request: text, json (an object a line), or auto, "
+        "which is text for a terminal and else json.",
+    ),
+]
 ShowLimits = Annotated[bool, typer.Option("--limits", help="Print every limit with its value, and exit.")]
 
 
@@ -110,6 +119,7 @@ def serve(
     executor: Executor = "",
     token_file: TokenFile = "",
     limit: Limit = None,
+    log: Log = "auto",
     limits: ShowLimits = False,
 ) -> None:
     """Serve renders, conversions and checks over HTTP, with a page at /.
@@ -125,15 +135,18 @@ def serve(
                 typer.echo(f"{row['name']:18} {row['value']:>12} {row['unit']:10} {row['meaning']}")
             return
         from ..service.app import Settings
+        from ..service.journal import KINDS
         from ..service.serve import serve as run
 
+        if log not in KINDS:
+            raise UsageError(f"--log {log}: choose from {', '.join(KINDS)}")
         settings = Settings(
             stage_root=stage_root, data=data, executor=executor, queue=queue, tokens=_tokens(token_file), limits=chosen,
             allow_hosts=tuple(allow_host or ()), allow_origins=tuple(allow_origin or ()),
             proxies=tuple(proxy or ()),
             workers=workers if workers is not None else _SENT if executor else os.cpu_count() or 1,
         )  # fmt: skip
-        run(settings, host, port)
+        run(settings, host, port, log)
 
 
 def _numbers(given: list[str]) -> dict[str, int | None]:
