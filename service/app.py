@@ -124,8 +124,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.jobs, app.state.settings, app.state.metrics = jobs, settings, metrics
     entry = door(settings.host, settings.allow_hosts, settings.allow_origins)
     app.add_middleware(Edge, door=entry, tokens=tokens_of(settings.tokens), metrics=metrics)
-    app.add_middleware(Journal)  # around all others
-    if settings.proxies:
+    app.add_middleware(Journal)
+    if settings.proxies:  # around all others, so that the log too has the client
         app.add_middleware(ProxyHeadersMiddleware, trusted_hosts=list(settings.proxies))
     _add_handlers(app)
     _add_pages(app, settings, metrics)

@@ -81,6 +81,7 @@ class Jobs:
         self._hidden = {*own_folders(), str(store.jobs.parent), *([str(stage_root)] if stage_root else ())}
         self.slots = Slots(workers, self._one, metrics)
         self._unsaved: set[str] = set()
+        """Jobs whose end could not be written down yet."""
 
     # --- life -------------------------------------------------------------------------------------------------------
 
@@ -119,7 +120,7 @@ class Jobs:
             record.created = now()  # the time it may wait begins anew
             self._kept.add(record.id)
             self._count()
-            self._line.put_nowait(record.id)
+            self.shares.enter(record, Client("", record.owner))
 
     def _identity_now(self, record: Record) -> str:
         """What the id of a job would be if it came in now."""
@@ -129,7 +130,7 @@ class Jobs:
             if self.stage_root is None or own_stage(self.stage_root, record.stage) != record.stage:
                 return ""
             digest = tree_digest(self.stage_root, record.stage)
-        return _identity(record.kind, digest, record.settings)
+        return _identity(record.kind, digest, record.settings, record.owner)
 
     # --- in ---------------------------------------------------------------------------------------------------------
 
@@ -155,8 +156,7 @@ class Jobs:
         Raises:
             Problem: there is no place for another job, or not for this client.
         """
-        owner = [client.owner] if client.owner else []
-        identifier = _identity(kind, digest, {**settings, 'owner': owner} if owner else settings)
+        identifier = _identity(kind, digest, settings, client.owner)
         known = self.records.get(identifier)
         if known and known.status in ("queued", "running", "done"):
             self.metrics.cached.inc()
@@ -437,8 +437,9 @@ def _problem_of(message: Any, discreet: Callable[[Any], str]) -> Problem:
     return Problem("stage-crashed", "the worker ended without an answer")
 
 
-def _identity(kind: str, digest: str, settings: dict[str, Any]) -> str:
-    wish = json.dumps([kind, engine(), digest, settings], sort_keys=True, allow_nan=False)
+def _identity(kind: str, digest: str, settings: dict[str, Any], owner: str) -> str:
+    # Each owner has jobs of its own: that somebody else has asked for the same is nobody's business.
+    wish = json.dumps([kind, engine(), digest, settings, *([owner] if owner else [])], sort_keys=True, allow_nan=False)
     return hashlib.sha256(wish.encode()).hexdigest()
 
 

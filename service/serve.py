@@ -49,7 +49,8 @@ def serve(settings: Settings, host: str, port: int, log: str = "auto") -> None:
     config = uvicorn.Config(
         app, host=host, port=port, http=_patient(settings.limits.header_seconds, gate), ws="none", lifespan="on",
         timeout_keep_alive=15, timeout_graceful_shutdown=settings.limits.drain_seconds, server_header=False,
-        log_config=None, access_log=False, backlog=_AT_ONCE, loop="asyncio", proxy_headers=False,
+        log_config=None, access_log=False, backlog=_AT_ONCE, loop="asyncio",
+        proxy_headers=False,  # `create_app` has those
     )  # fmt: skip
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     # With the protocol named, asyncio switches Nagle's delay off; else each answer would take 40 ms more.

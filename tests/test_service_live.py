@@ -550,7 +550,7 @@ def test_an_exception_in_a_worker_is_a_fault_of_ours(monkeypatch: pytest.MonkeyP
         ours, theirs = socket.socketpair()
         with ours, theirs:
             ours.sendall(b"{}\n")
-            assert worker._serve(theirs.fileno()) == 0
+            assert worker._serve(theirs.fileno(), os.open(os.devnull, os.O_WRONLY)) == 0
             said = [json.loads(line) for line in ours.recv(65536).splitlines()]
         assert said[0] == {"began": True}
         assert said[1]["problem"]["slug"] == slug
