@@ -174,7 +174,9 @@ def _read(
         "notices": notices,
     }
     cameras = choose_camera(stage, time, read_cameras(stage, time, **frame), camera, bounds, notices)
-    lights, environment = read_lights(stage, time, purposes=purposes, **frame)
+    things = [mesh.path for mesh in meshes] + [ball.path for ball in spheres]
+    paths = tuple(dict.fromkeys(path.partition("/[")[0] for path in things))
+    lights, environment = read_lights(stage, time, purposes=purposes, drawn=paths, **frame)
     every = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
     glow, dull = _glow(tables, meshes, spheres)
     if glow and dull and not lights and environment is None:

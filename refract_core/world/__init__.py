@@ -2,4 +2,6 @@
 that leaves an opaque hit. And what closed meshes enclose.
 """
 
-__all__ = ["embree", "environment", "lights", "offsets", "shading", "solid", "surface", "tables", "textures", "tracing"]
+__all__ = [
+    "embree", "environment", "lamps", "lights", "offsets", "shading", "solid", "surface", "tables", "textures", "tracing",
+]  # fmt: skip

@@ -14,6 +14,7 @@ from .embree import (
     DIR_Y,
     DIR_Z,
     MASK,
+    OPAQUE,
     ORG_X,
     SCATTERED,
     SOLID,
@@ -114,10 +115,23 @@ def visible(packet: Packet, world: World, mask: int, seen: Scalars) -> None:
     Solid things are asked first, all at once; only where they leave the way free must cut-outs be looked at.
     Glass does not cast shadows: light on its way to an opaque surface is not bent (no caustics).
     """
+    _visible(packet, world, mask & ~CUTOUT, mask & CUTOUT, seen)
+
+
+@inlined
+def lamp_visible(packet: Packet, world: World, mask: int, which: int, seen: Scalars) -> None:
+    """The same for rays to a light, whose shadows not everything may cast. A probe's own set goes before that."""
+    shift = world.lights.caster_shift[which] if mask & OPAQUE != 0 else 0
+    _visible(packet, world, (mask & ~CUTOUT) << shift, (mask & CUTOUT) << shift, seen)
+
+
+@inlined
+def _visible(packet: Packet, world: World, solid: int, cutout: int, seen: Scalars) -> None:
+    """`visible`, with a mask of its own for cut-outs."""
     for lane in range(LANES):
         packet.ends[lane] = packet.rays[T_FAR, lane]
         if packet.valid[lane] != 0:
-            packet.words[MASK, lane] = mask & ~CUTOUT
+            packet.words[MASK, lane] = solid
     occluded(packet, world.geometry.handle, COHERENT)
     if not world.cutouts:
         for lane in range(LANES):
@@ -127,7 +141,7 @@ def visible(packet: Packet, world: World, mask: int, seen: Scalars) -> None:
         packet.shadowed[lane] = packet.valid[lane]
         if is_blocked(packet, lane):
             packet.valid[lane] = 0
-        packet.words[MASK, lane] = mask & CUTOUT
+        packet.words[MASK, lane] = cutout
     intersect_world(packet, world, packet.ends, SCATTERED)
     for lane in range(LANES):
         free = packet.valid[lane] != 0 and not has_hit(packet, lane)

@@ -66,7 +66,7 @@ def read_dome(
         except ImageError as error:
             notices.append(Notice(path, f"dome texture cannot be read: {error}; the light is skipped"))
             return None
-        pixels = _finite(pixels, path, notices)
+        pixels = finite(pixels, path, notices, "dome texture")
     turned = rotation(world_from_light[:3, :3]) @ _pole(prim, notices)
     return Dome(np.asarray(radiance, np.float32), pixels, turned)
 
@@ -160,12 +160,12 @@ def _pole(prim: Usd.Prim, notices: list[Notice]) -> F64:
     return np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
-def _finite(pixels: F32, path: str, notices: list[Notice]) -> F32:
+def finite(pixels: F32, path: str, notices: list[Notice], what: str) -> F32:
     """NaN becomes black and infinity the largest finite value of the map."""
     bad = ~np.isfinite(pixels)
     if not bad.any():
         return pixels
     count = int(bad.any(axis=-1).sum())
-    notices.append(Notice(path, f"dome texture has {count} pixel(s) that are NaN or infinite; they are replaced"))
+    notices.append(Notice(path, f"{what} has {count} pixel(s) that are NaN or infinite; they are replaced"))
     largest = float(pixels[~bad].max(initial=0.0))
     return np.nan_to_num(pixels, nan=0.0, posinf=largest, neginf=0.0)
