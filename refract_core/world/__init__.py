@@ -3,5 +3,6 @@ that leaves an opaque hit. And what closed meshes enclose.
 """
 
 __all__ = [
-    "embree", "environment", "lamps", "lights", "offsets", "shading", "solid", "surface", "tables", "textures", "tracing",
+    "embree", "environment", "lamps", "lights", "offsets", "shading", "shaping", "solid", "surface", "tables",
+    "textures", "tracing",
 ]  # fmt: skip

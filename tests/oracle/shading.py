@@ -11,7 +11,7 @@ from . import lights, sampling
 from .sampling import Key
 from .sky import Sky, sky_of
 from .surface import Surface, number, specular_albedo, surface_at
-from .vec import ZERO, Vec, add, basis, clamp, cross, dot, mul, scaled, sub, unit, vec
+from .vec import ZERO, Vec, add, basis, clamp, cross, dot, mix, mul, scaled, sub, unit, vec
 from .world import NEAR, OPAQUE, Hit, World, first
 
 _MIRROR_ALPHA = 1e-3
@@ -69,8 +69,18 @@ class Shader:
             bits = ray_bits(o, d)
         return opacity > sampling.hashed(bits[0], bits[1], bits[2] ^ hit.face.part) / 2**32
 
-    def _free(self, surface: Surface, d: Vec, distance: float) -> bool:
-        return self.nearest(surface.point, d, OPAQUE, distance * (1.0 - 1e-4)) is None
+    def _free(self, surface: Surface, d: Vec, distance: float, casters: tuple[str, ...] | None = None) -> bool:
+        def stands(hit: Hit) -> bool:
+            named = casters is None or hit.face.shape.path in casters
+            return named and self.present(hit, surface.point, d, None)
+
+        far = distance * (1.0 - 1e-4)
+        return first(self.world.candidates(surface.point, d, NEAR, far, OPAQUE), stands) is None
+
+    def path_of(self, thing: int) -> str:
+        scene = self.scene
+        of = scene.meshes[thing] if thing < len(scene.meshes) else scene.spheres[thing - len(scene.meshes)]
+        return of.path
 
     # --- Light ---
 
@@ -80,18 +90,29 @@ class Shader:
         fresnel = mirrored or _lowered_schlick(s)
         coat = s.coat * (0.04 + 0.96 * (1.0 - clamp(dot(s.ns, s.wo))) ** 5)
         for k, lamp in enumerate(self.lamps):
+            if lamp.lit is not None and self.path_of(s.thing) not in lamp.lit:
+                continue
             even = lights.irradiance(lamp, s.point, s.ns) * lamp.diffuse
             gloss = lights.highlight(lamp, s.point, s.ns, s.wo, s.roughness**2) * lamp.specular
             over = coat * lights.highlight(lamp, s.point, s.ns, s.wo, s.coat_roughness**2) * lamp.specular
             if even + gloss + over <= 0.0:
                 continue
-            if lamp.kind is not None:
+            seen = 1.0
+            if lamp.shadows:
                 u1, u2 = sampling.pair(key, sample, sampling.FIRST_LIGHT + k)
                 d, distance = lights.shadow_target(lamp, s.point, u1, u2)
-                if not self._free(s, d, distance):
-                    continue
-            irradiance = add(irradiance, scaled(lamp.radiance, even))
-            highlights = add(highlights, mul(lamp.radiance, vec([gloss * f + over for f in fresnel])))
+                shadow = lamp.shadow
+                if shadow.distance < math.inf:
+                    u = sampling.pair(key, sample, sampling.SHADOW_LENGTH)[0]
+                    distance = min(distance, shadow.distance - shadow.falloff * u ** (1.0 / shadow.gamma))
+                seen = 1.0 if self._free(s, d, distance, lamp.casters) else 0.0
+            arrives = mul(lamp.radiance, mix(lamp.shadow.color, (1.0, 1.0, 1.0), seen))
+            irradiance = add(irradiance, scaled(mul(arrives, lights.tint(lamp, s.point, s.ns)), even))
+            base = vec([gloss * f for f in fresnel])
+            for weight, roughness in ((base, s.roughness), ((over,) * 3, s.coat_roughness)):
+                if max(weight) > 0.0:
+                    shape = lights.mirrored_tint(lamp, s.point, s.ns, s.wo, roughness**2)
+                    highlights = add(highlights, mul(mul(arrives, shape), weight))
         seen = ZERO
         if self.sky is not None:
             d, share = self._sky_direction(self.sky, s.ns, key, sample)
