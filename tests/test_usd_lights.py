@@ -343,7 +343,6 @@ def test_an_eight_bit_dome_is_decoded_from_srgb(tmp_path: Path) -> None:
     ("inputs", "said"),
     [
         ("asset inputs:texture:file = @none.exr@", "none.exr"),
-        ('asset inputs:texture:file = @none.exr@\ntoken inputs:texture:format = "mirroredBall"', "mirroredBall"),
     ],
 )
 def test_a_dome_map_that_cannot_be_used_is_named_and_skipped(inputs: str, said: str) -> None:
@@ -665,3 +664,86 @@ def test_colour_temperature_is_a_black_bodys(kelvin: float) -> None:
     expected = np.maximum(planckian(kelvin), 0.0)
     assert np.array(light.radiance) == pytest.approx(expected, abs=0.03 * expected.max())
     assert np.dot(light.radiance, (0.2126, 0.7152, 0.0722)) == pytest.approx(1.0, abs=2e-3)
+
+
+# --- Other forms of a dome's map ------------------------------------------------------------------------------------
+
+
+def painted(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A smooth sky without symmetry, by direction in the dome's frame."""
+    x, y, z = (direction[..., k] for k in range(3))
+    return np.stack([1 + x + 0.5 * y * z, 1.2 + y - 0.3 * x, 1.4 + z + 0.2 * x * y], -1)
+
+
+def ball_photograph(n: int) -> NDArray[np.float32]:
+    """A mirrored ball seen along -Z by an eye at +Z whose right is +X: what each of its normals reflects."""
+    v, u = np.mgrid[0:n, 0:n]
+    x, y = (u + 0.5) / n * 2 - 1, 1 - (v + 0.5) / n * 2
+    z = np.sqrt(np.maximum(0.0, 1 - x * x - y * y))
+    normal = np.stack([x, y, z], -1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    return np.asarray(painted(2 * normal[..., 2:] * normal - np.array([0, 0, 1.0])), np.float32)
+
+
+def light_probe(n: int) -> NDArray[np.float32]:
+    """The radius is the angle from +Z; +X is at the left, as in a latlong map."""
+    v, u = np.mgrid[0:n, 0:n]
+    a, b = (u + 0.5) / n * 2 - 1, 1 - (v + 0.5) / n * 2
+    radius = np.hypot(a, b)
+    off = np.minimum(radius, 1.0) * np.pi
+    side = np.sin(off) / np.maximum(radius, 1e-9)
+    return np.asarray(painted(np.stack([-a * side, b * side, np.cos(off)], -1)), np.float32)
+
+
+def vertical_cross(n: int) -> NDArray[np.float32]:
+    """Folded up it is a box seen from within: +Z in the middle, +Y above, +X at its left, -Z last, hung from -Y."""
+    out = np.zeros((4 * n, 3 * n, 3), np.float32)
+    t, s = np.mgrid[0:n, 0:n]
+    s, t = (s + 0.5) / n * 2 - 1, 1 - (t + 0.5) / n * 2
+    one = np.ones_like(s)
+    faces = {(0, 1): (-s, one, -t), (1, 0): (one, t, s), (1, 1): (-s, t, one), (1, 2): (-one, t, -s),
+             (2, 1): (-s, -one, t), (3, 1): (-s, -t, -one)}  # fmt: skip
+    for (row, column), axes in faces.items():
+        d = np.stack(axes, -1)
+        d = d / np.linalg.norm(d, axis=-1, keepdims=True)
+        out[row * n : (row + 1) * n, column * n : (column + 1) * n] = painted(d)
+    return out
+
+
+@pytest.mark.parametrize("said", ["authored", "automatic"])
+@pytest.mark.parametrize(
+    ("form", "pixels", "guessed"),
+    [("mirroredBall", ball_photograph(256), False), ("angular", light_probe(256), True),
+     ("cubeMapVerticalCross", vertical_cross(64), True)],
+    ids=["ball", "angular", "cross"],
+)  # fmt: skip
+def test_every_form_of_a_map_shows_the_same_sky(
+    tmp_path: Path, said: str, form: str, pixels: NDArray[np.float32], guessed: bool
+) -> None:
+    """Each drawn here by its own geometry, and found again in every direction; what sides do not tell must be said."""
+    if said == "automatic" and not guessed:
+        return
+    path = tmp_path / "sky.exr"
+    file = oiio.ImageOutput.create(str(path))
+    assert file is not None
+    assert file.open(str(path), oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, oiio.FLOAT))
+    assert file.write_image(pixels)
+    file.close()
+    token = form if said == "authored" else "automatic"
+    text = f'asset inputs:texture:file = @{path}@\ntoken inputs:texture:format = "{token}"'
+    _, environment, notices = read(f'def DomeLight "D"\n{{\n{text}\n}}')
+    assert [form in notice.text for notice in notices] == ([True] if said == "automatic" else [])
+    height = 128
+    found = lookup(environment.pixels, directions(slice(0, height), height, 2 * height))  # type: ignore[union-attr]
+    expected = painted(directions(slice(0, height), height, 2 * height))
+    behind = directions(slice(0, height), height, 2 * height)[..., 2] < -0.97  # there a ball shows next to nothing
+    assert np.abs(found - expected)[~behind].max() < 0.04
+    assert np.abs(found - expected)[~behind].mean() < 0.005
+
+
+def test_a_form_that_nobody_knows_is_named(tmp_path: Path) -> None:
+    path = compass(tmp_path / "sky.exr")
+    text = f'asset inputs:texture:file = @{path}@\ntoken inputs:texture:format = "fisheye"'
+    _, environment, notices = read(f'def DomeLight "D"\n{{\n{text}\n}}')
+    assert "fisheye" in notices[0].text
+    assert environment is not None
