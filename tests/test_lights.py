@@ -14,7 +14,7 @@ from scenes import box, camera, draw, light, material, quad, scene
 
 from refract_core.kernels.compile import kernel
 from refract_core.kernels.pointer import Pointer
-from refract_core.scene import Light, LightKind, Mesh, Model, Scene, Shaping
+from refract_core.scene import Light, LightKind, Mesh, Model, Scene, Shadow, Shaping
 from refract_core.world.lamps import _picture_levels, pack_lights
 from refract_core.world.lights import _angle_over_sine, irradiance_factor
 from refract_core.world.shaping import shape_matt
@@ -473,3 +473,99 @@ def test_the_picture_on_a_light_is_its_own_mean() -> None:
     assert [len(level) for level in levels] == [1, 2, 4, 8, 16, 32, 64, 128]
     for level in levels:
         np.testing.assert_allclose(level.mean((0, 1)), np.nan_to_num(picture).mean((0, 1)), rtol=1e-4)
+
+
+# --- Shadows and links in a picture ---------------------------------------------------------------------------------
+
+CARD = [(-0.5, 1, 0.5), (0.5, 1, 0.5), (0.5, 1, -0.5), (-0.5, 1, -0.5)]
+
+
+def under_the_card(lamp: Light, **settings: Any) -> tuple[F64, F64]:
+    """Light on the floor in the deep of the card's shadow, and what would be there without it; shape (3,)."""
+    planes = draw(look_down((lamp,), (quad("/card", CARD),)), 64, 64, **settings)
+    free = draw(look_down((lamp,)), 64, 64, **settings)
+    place = planes["P"]
+    deep = (place[..., 1] < 0.5) & (np.abs(place[..., [0, 2]]).max(-1) < 0.45)
+    assert deep.sum() > 20
+    return planes["beauty"][deep][:, :3].astype(np.float64).mean(0), free["beauty"][deep][:, :3].mean(0)
+
+
+POINT = light(LightKind.SPHERE, (0, 3, 0), (0, -1, 0), (0.0, 0))
+
+
+@pytest.mark.parametrize("samples", [1, 4])
+def test_a_light_without_shadows_shines_through(samples: int) -> None:
+    found, free = under_the_card(replace(POINT, casts_shadow=False), samples=samples)
+    np.testing.assert_allclose(found, free, rtol=1e-5)
+
+
+@pytest.mark.parametrize("samples", [1, 4])
+def test_a_shadow_has_its_colour(samples: int) -> None:
+    found, free = under_the_card(replace(POINT, shadow=Shadow(color=(0.1, 0.0, 0.5))), samples=samples)
+    np.testing.assert_allclose(found, free * (0.1, 0.0, 0.5), rtol=1e-5, atol=1e-7)
+
+
+def test_what_is_too_far_casts_no_shadow() -> None:
+    """The card is 1 m above the floor, and a little more along a slanted ray."""
+    found, free = under_the_card(replace(POINT, shadow=Shadow(distance=0.98)))
+    np.testing.assert_allclose(found, free, rtol=1e-5)
+    assert under_the_card(replace(POINT, shadow=Shadow(distance=1.2)))[0].max() == 0.0
+
+
+@pytest.mark.parametrize("gamma", [0.5, 1.0, 3.0])
+def test_a_shadow_fades_over_its_falloff(gamma: float) -> None:
+    """A sun above: the card is 1 m from every place, half way into the falloff from 0.5 to 1.5."""
+    sun = light(LightKind.DISTANT, (0, 9, 0), (0, -1, 0), (0.0, 0))
+    sun = replace(sun, shadow=Shadow(distance=1.5, falloff=1.0, gamma=gamma))
+    found, free = under_the_card(sun, samples=64, tolerance=0.0)
+    assert found / free == pytest.approx(np.full(3, 1.0 - 0.5**gamma), abs=0.02)
+
+
+@pytest.mark.parametrize("samples", [1, 4])
+def test_a_light_lights_what_it_is_linked_to(samples: int) -> None:
+    left = quad("/left", [(-9, 0, 9), (0, 0, 9), (0, 0, -9), (-9, 0, -9)])
+    right = quad("/right", [(0, 0, 9), (9, 0, 9), (9, 0, -9), (0, 0, -9)])
+    glossy = material("/glossy", DIFFUSE=0.5, IOR=1.5, ROUGHNESS=0.3, CLEARCOAT=1.0)
+
+    def picture(lit: tuple[str, ...] | None) -> dict[str, NDArray[np.float32]]:
+        lamp = replace(light(LightKind.RECT, (0, 2, -1), (0, -1, 0), (0.5, 0.5), 4.0), lit=lit)
+        eye = camera((0, 4, 3), (0, 0, 0))
+        return draw(scene([left, right], [glossy], lights=(lamp,), cameras=(eye,)), 32, 32, samples=samples)
+
+    whole, some = picture(None), picture(("/left",))
+    on_left = whole["P"][..., 0] < -0.3
+    np.testing.assert_array_equal(some["beauty"][on_left], whole["beauty"][on_left])
+    assert some["beauty"][whole["P"][..., 0] > 0.3][:, :3].max() == 0.0
+    assert whole["beauty"][..., :3].min() > 0.0
+
+
+@pytest.mark.parametrize("samples", [1, 4])
+def test_only_those_cast_shadows_that_a_light_names(samples: int) -> None:
+    """Two cards side by side; the light knows of one, another light of both."""
+    cards = [quad(f"/card{k}", np.array(CARD) + np.array([1.2 * k - 0.6, 0, 0])) for k in range(2)]
+
+    def shadows(casters: tuple[str, ...] | None) -> list[bool]:
+        lamp = replace(light(LightKind.DISTANT, (0, 9, 0), (0, -1, 0), (0.0, 0)), casters=casters)
+        planes = draw(look_down((lamp,), tuple(cards)), 96, 96, samples=samples)
+        p = planes["P"]
+        under = [(p[..., 1] < 0.5) & (np.abs(p[..., 0] - 1.2 * k + 0.6) < 0.4) & (np.abs(p[..., 2]) < 0.4)
+                 for k in range(2)]  # fmt: skip
+        return [bool((planes["beauty"][mask][:, 0] == 0.0).all()) for mask in under]
+
+    assert shadows(None) == [True, True]
+    assert shadows(("/card1",)) == [False, True]
+    assert shadows(()) == [False, False]
+
+
+@pytest.mark.parametrize("kind", [LightKind.RECT, LightKind.CYLINDER])
+def test_a_mirror_shows_the_light_itself(kind: LightKind) -> None:
+    """A polished floor under a light: its picture is the light's own, of its radiance; a cone shuts it off."""
+    of = light(kind, (0, 2, 0), (0, -1, 0), (1.0, 0.6) if kind is LightKind.RECT else (0.2, 1.0), 3.0)
+    mirror = material("/mirror", DIFFUSE=1.0, METALLIC=1.0, ROUGHNESS=0.0)
+    eye = camera((0, 4, 2), (0, 0, 0))
+    bright = draw(scene([quad("/floor", FLOOR)], [mirror], lights=(of,), cameras=(eye,)), 64, 64)["beauty"][..., 0]
+    assert bright.max() == pytest.approx(3.0, rel=0.02)
+    assert 0.003 < (bright > 1.5).mean() < 0.2
+    narrow = replace(of, shaping=Shaping(cone=math.radians(2)))
+    dark = draw(scene([quad("/floor", FLOOR)], [mirror], lights=(narrow,), cameras=(eye,)), 64, 64)["beauty"][..., 0]
+    assert dark.max() == 0.0

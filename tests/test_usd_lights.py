@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -510,7 +511,7 @@ def test_more_sets_of_casters_than_masks_are_named() -> None:
 # --- Measured profiles ----------------------------------------------------------------------------------------------
 
 
-def ies(vertical: list[float], horizontal: list[float], candela: list[list[float]], factor: float = 1.0,
+def ies(vertical: Sequence[float], horizontal: Sequence[float], candela: Sequence[Sequence[float]], factor: float = 1.0,
         kind: int = 1, tilt: str = "NONE") -> str:  # fmt: skip
     """An LM-63-2002 file; `candela` by horizontal angle, then by vertical."""
     rows = "\n".join(" ".join(f"{v:g}" for v in row) for row in candela)

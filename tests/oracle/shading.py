@@ -97,7 +97,7 @@ class Shader:
             over = coat * lights.highlight(lamp, s.point, s.ns, s.wo, s.coat_roughness**2) * lamp.specular
             if even + gloss + over <= 0.0:
                 continue
-            seen = 1.0
+            open_share = 1.0
             if lamp.shadows:
                 u1, u2 = sampling.pair(key, sample, sampling.FIRST_LIGHT + k)
                 d, distance = lights.shadow_target(lamp, s.point, u1, u2)
@@ -105,8 +105,8 @@ class Shader:
                 if shadow.distance < math.inf:
                     u = sampling.pair(key, sample, sampling.SHADOW_LENGTH)[0]
                     distance = min(distance, shadow.distance - shadow.falloff * u ** (1.0 / shadow.gamma))
-                seen = 1.0 if self._free(s, d, distance, lamp.casters) else 0.0
-            arrives = mul(lamp.radiance, mix(lamp.shadow.color, (1.0, 1.0, 1.0), seen))
+                open_share = 1.0 if self._free(s, d, distance, lamp.casters) else 0.0
+            arrives = mul(lamp.radiance, mix(lamp.shadow.color, (1.0, 1.0, 1.0), open_share))
             irradiance = add(irradiance, scaled(mul(arrives, lights.tint(lamp, s.point, s.ns)), even))
             base = vec([gloss * f for f in fresnel])
             for weight, roughness in ((base, s.roughness), ((over,) * 3, s.coat_roughness)):
