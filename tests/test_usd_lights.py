@@ -13,11 +13,12 @@ import pytest
 from numpy.typing import NDArray
 from pxr import Usd, UsdLux
 
-from refract_core.scene import Environment, Light, LightKind, Notice
+from refract_core.scene import Environment, Light, LightKind, Notice, Param
 from refract_core.usd.lights.domes import directions, linear, lookup
 from refract_core.usd.lights.ies import Ies, parse, profile
 from refract_core.usd.lights.read import read_lights
 from refract_core.usd.materials.textures import read_texture
+from refract_core.usd.stage import scene_from_stage
 
 IDENTITY = np.eye(4)
 Read = tuple[tuple[Light, ...], Environment | None, list[Notice]]
@@ -748,3 +749,59 @@ def test_a_form_that_nobody_knows_is_named(tmp_path: Path) -> None:
     _, environment, notices = read(f'def DomeLight "D"\n{{\n{text}\n}}')
     assert "fisheye" in notices[0].text
     assert environment is not None
+
+
+# --- Meshes that are lights -----------------------------------------------------------------------------------------
+
+SQUARE = """
+    int[] faceVertexCounts = [4]
+    int[] faceVertexIndices = [0, 1, 2, 3]
+    point3f[] points = [(0, 0, 0), (2, 0, 0), (2, 0, 3), (0, 0, 3)]
+    uniform token subdivisionScheme = "none"
+"""
+
+
+def emitted(text: str) -> tuple[dict[str, tuple[float, ...]], list[str]]:
+    """Emission of every mesh by its path, and the paths of notices."""
+    stage = Usd.Stage.CreateInMemory()
+    stage.GetRootLayer().ImportFromString(f'#usda 1.0\n(\n    metersPerUnit = 0.5\n    upAxis = "Y"\n)\n{text}\n')
+    what = scene_from_stage(stage)
+    found = {m.path: what.materials[m.materials[0]].inputs[Param.EMISSIVE].value[:3] for m in what.meshes}
+    return found, [notice.path for notice in what.notices]
+
+
+def test_a_mesh_light_glows_by_its_inputs() -> None:
+    api = '(prepend apiSchemas = ["MeshLightAPI"])'
+    bright = "float inputs:intensity = 3\nfloat inputs:exposure = 1\ncolor3f inputs:color = (1, 0.5, 0)"
+    found, said = emitted(f'def Mesh "L" {api} {{ {SQUARE}\n{bright}\n}}\ndef Mesh "Other" {{ {SQUARE} }}')
+    assert found == {"/L": pytest.approx((6, 3, 0)), "/Other": (0, 0, 0)}
+    assert "/L" in said
+    found, _ = emitted(f'def Mesh "L" {api} {{ {SQUARE}\n{bright}\nbool inputs:normalize = 1\n}}')
+    assert found["/L"] == pytest.approx((1, 0.5, 0))  # an area of 6 in the stage's units
+
+
+def test_a_geometry_light_makes_its_mesh_glow() -> None:
+    light = 'def GeometryLight "G" { float inputs:intensity = 4\nrel geometry = </M>\n}'
+    found, said = emitted(f'def Mesh "M" {{ {SQUARE} }}\n{light}')
+    assert found["/M"] == (4.0, 4.0, 4.0)
+    assert "/G" in said
+
+
+def test_a_bound_material_glows_by_itself_unless_the_light_says_otherwise() -> None:
+    material = """
+    def Material "Mat"
+    {
+        token outputs:surface.connect = </Mat/S.outputs:surface>
+        def Shader "S"
+        {
+            uniform token info:id = "UsdPreviewSurface"
+            color3f inputs:emissiveColor = (0.25, 0, 0)
+            token outputs:surface
+        }
+    }
+    """
+    api = '(prepend apiSchemas = ["MeshLightAPI", "MaterialBindingAPI"])'
+    mesh = f'def Mesh "L" {api} {{ {SQUARE}\nrel material:binding = </Mat>\n'
+    assert emitted(material + mesh + "}")[0]["/L"] == (0.25, 0.0, 0.0)
+    alone = 'uniform token light:materialSyncMode = "noMaterialResponse"\n}'
+    assert emitted(material + mesh + alone)[0]["/L"] == (1.0, 1.0, 1.0)

@@ -14,6 +14,8 @@ from ...scene import F64, Environment, Light, LightKind, Notice
 from ...world.embree import CASTER_SHIFTS
 from .context import Context, note, number, value
 from .domes import Dome, read_dome, rotation, sum_domes
+from .emission import emission
+from .meshes import is_mesh_light
 from .shaping import is_linked, read_link, read_shadow, read_shaping
 
 _DOMES = ("DomeLight", "DomeLight_1")
@@ -85,12 +87,15 @@ def _read_light(
     name = str(prim.GetTypeName())
     if name not in ROWS and name not in _DOMES:
         label = "MeshLightAPI" if prim.HasAPI(UsdLux.MeshLightAPI) else name or "LightAPI"
+        if is_mesh_light(prim):
+            note(context, prim, f"{label} glows, but lights nothing else")
+            return
         hint = " (sampling of the dome goes on without it)" if name == "PortalLight" else ""
         note(context, prim, f"{label} is ignored: it is not rendered as a light{hint}")
         return
     light = UsdLux.LightAPI(prim)
-    emission = _emission(context, light)
-    if emission is None:
+    shining = emission(context, light)
+    if shining is None:
         return
     _note_ignored(context, prim)
     world_from_light = context.engine_from_stage @ np.array(context.xforms.GetLocalToWorldTransform(prim), np.float64).T
@@ -99,7 +104,7 @@ def _read_light(
         return
     if name in _DOMES:
         dome = read_dome(
-            light, context.time, radiance=emission, world_from_light=world_from_light, notices=context.notices
+            light, context.time, radiance=shining, world_from_light=world_from_light, notices=context.notices
         )
         if dome is not None:
             domes.append(dome)
@@ -108,7 +113,7 @@ def _read_light(
     shape = row.read(context, prim, world_from_light)
     if shape is None:
         return
-    r, g, b = (channel * shape.factor for channel in emission)
+    r, g, b = (channel * shape.factor for channel in shining)
     casts_shadow, shadow = read_shadow(context, prim)
     lights.append(
         Light(
@@ -134,39 +139,6 @@ def _shown(prim: Usd.Prim, time: Usd.TimeCode, purposes: tuple[str, ...]) -> boo
         return True
     visible = imageable.ComputeVisibility(time) != UsdGeom.Tokens.invisible
     return visible and str(imageable.ComputePurpose()) in purposes
-
-
-def _emission(context: Context, light: UsdLux.LightAPI) -> tuple[float, float, float] | None:
-    """color * intensity * 2^exposure * colour temperature (UsdLuxLightAPI); None with a notice where it is no number.
-
-    `normalize` is not in it: it needs the light's shape.
-    """
-    prim = light.GetPrim()
-    intensity = float(value(context, prim, "inputs:intensity", 1.0))
-    exposure = float(value(context, prim, "inputs:exposure", 0.0))
-    color = np.array(value(context, prim, "inputs:color", (1.0, 1.0, 1.0)), np.float64)
-    with np.errstate(over="ignore", invalid="ignore"):
-        emission = color * intensity * np.exp2(exposure) * _temperature(context, prim)
-    if not np.isfinite(emission).all() or (emission < 0.0).any() or float(emission.max()) > 1e30:
-        shown = tuple(color.tolist())
-        note(context, prim, f"intensity {intensity}, exposure {exposure}, color {shown} is no finite positive "
-                             "emission; the light is skipped; author values of at least 0")  # fmt: skip
-        return None
-    return (float(emission[0]), float(emission[1]), float(emission[2]))
-
-
-def _temperature(context: Context, prim: Usd.Prim) -> F64:
-    """Colour of a black body [linear BT.709], shape (3,), 1 where the light does not ask for one."""
-    if not value(context, prim, "inputs:enableColorTemperature", False):
-        return np.ones(3)
-    kelvin = float(value(context, prim, "inputs:colorTemperature", 6500.0))
-    low, high = 1000.0, 10000.0  # as UsdLux has it
-    if not low <= kelvin <= high:  # usd-core 26.11 crashes on NaN
-        used = min(max(kelvin, low), high) if math.isfinite(kelvin) else 6500.0
-        note(context, prim, f"inputs:colorTemperature is {kelvin}; the valid range is {low:g} to {high:g} K; "
-                             f"{used:g} is used")  # fmt: skip
-        kelvin = used
-    return np.array(UsdLux.BlackbodyTemperatureAsRgb(kelvin), np.float64)
 
 
 def _factor(context: Context, prim: Usd.Prim, area: float) -> float:
