@@ -31,6 +31,7 @@ def shape_matt(lights: LightTable, which: int, p: Vec, n: Vec) -> Vec:
     distance = max(length(to), 1e-9)
     reach = _half_extent(kind, lamp)
     plain = shapes.focus[which] <= 0.0 and shapes.profile[which, 1] == 0 and shapes.picture[which, 0] < 0
+    crossed = shapes.cone[which, 1] < math.pi
     if reach < distance:
         off = _angle(dot(to, lamp.face) / -distance)
         wide = math.asin(reach / distance)
@@ -38,7 +39,8 @@ def shape_matt(lights: LightTable, which: int, p: Vec, n: Vec) -> Vec:
             return _BLACK
         if plain and off + wide <= shapes.cone[which, 0]:
             return _WHITE
-    sharp = shapes.cone[which, 1] < math.pi and shapes.cone[which, 1] - shapes.cone[which, 0] < reach / distance
+        crossed = crossed and off + wide > shapes.cone[which, 0]
+    sharp = crossed and shapes.cone[which, 1] - shapes.cone[which, 0] < reach / distance
     firsts, seconds = _grid(kind, lamp, distance, 2 if sharp else 1)
     level = 0
     if shapes.picture[which, 0] >= 0:
@@ -117,7 +119,9 @@ def _half_extent(kind: int, lamp: Lamp) -> float:
 def _pieces(half: float, distance: float, times: int) -> int:
     """Along a side of a light: more the wider it is seen, and `times` as many where an edge crosses it."""
     wide = 2.0 * half / distance
-    return 1 if wide <= 0.0 else times * (4 if wide < 0.3 else 8 if wide < 1.0 else 16)
+    if wide <= 0.0:
+        return 1
+    return times * (1 if wide < 0.04 else 2 if wide < 0.1 else 4 if wide < 0.3 else 8 if wide < 1.0 else 16)
 
 
 @inlined

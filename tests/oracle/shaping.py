@@ -39,6 +39,7 @@ def mean(shaping: Shaping, kind: LightKind, place: Place, axes: tuple[Vec, Vec, 
     reach = a if place.round else math.hypot(a, b)
     plain = shaping.focus == 0.0 and shaping.profile is None and shaping.picture is None
     start = shaping.cone * (1.0 - shaping.softness)
+    crossed = shaping.cone < math.pi
     if reach < far:
         off = math.acos(clamp(dot(sub(p, place.centre), axes[2]) / far, -1.0, 1.0))
         wide = math.asin(reach / far)
@@ -46,12 +47,13 @@ def mean(shaping: Shaping, kind: LightKind, place: Place, axes: tuple[Vec, Vec, 
             return (0.0, 0.0, 0.0)
         if plain and off + wide <= start:
             return WHITE
-    finer = 2 if shaping.cone < math.pi and shaping.cone - start < reach / far else 1
+        crossed = crossed and off + wide > start
+    finer = 2 if crossed and shaping.cone - start < reach / far else 1
     m, k = finer * _parts(a / far), finer * _parts(b / far)
     if kind is LightKind.CYLINDER:
         k = min(k, 4 * finer)
     if place.round:
-        m, k = ((m // 2, 2 * m) if a > 0.0 else (1, 1))
+        m, k = ((m + 1) // 2, 2 * m) if a > 0.0 and m > 1 else (1, 1)
     if a == 0.0:
         m = 1
     if b == 0.0 and not place.round:
@@ -78,7 +80,7 @@ def mean(shaping: Shaping, kind: LightKind, place: Place, axes: tuple[Vec, Vec, 
 
 
 def _parts(half_angle: float) -> int:
-    return 4 if 2.0 * half_angle < 0.3 else 8 if 2.0 * half_angle < 1.0 else 16
+    return next((count for limit, count in ((0.04, 1), (0.1, 2), (0.3, 4), (1.0, 8)) if 2.0 * half_angle < limit), 16)
 
 
 def leaving(shaping: Shaping, axes: tuple[Vec, Vec, Vec], d: Vec, blur: float) -> Vec:
