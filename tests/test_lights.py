@@ -89,10 +89,10 @@ def test_rect_equals_quadrature(point: tuple[float, ...], normal: tuple[float, .
 
 @pytest.mark.parametrize(("point", "normal"), PLACES)
 def test_disk_equals_quadrature(point: tuple[float, ...], normal: tuple[float, ...]) -> None:
-    """The engine's twelve-gon has the disk's area, so only its outline differs: under a hundredth near by."""
+    """The engine's twelve-gon has the disk's area, so only its outline differs."""
     lamp = light(LightKind.DISK, (0, 2, 0), (0.3, -1, 0.2), (0.6, 0))
     expected = flat_quadrature(lamp, disk_samples(0.6), np.array(point), np.array(normal))
-    assert factor(lamp, point, normal)[0] == pytest.approx(expected, rel=1e-2, abs=1e-3)
+    assert factor(lamp, point, normal)[0] == pytest.approx(expected, rel=2e-3, abs=2e-4)
 
 
 @pytest.mark.parametrize("height", [0.2, 1.0, 5.0])
@@ -100,7 +100,7 @@ def test_disk_overhead_is_the_textbook_ratio(height: float) -> None:
     """E / L = pi r^2 / (r^2 + h^2) under the middle of a disk (any radiometry text)."""
     lamp = light(LightKind.DISK, (0, height, 0), (0, -1, 0), (0.6, 0))
     expected = math.pi * 0.36 / (0.36 + height**2)
-    assert factor(lamp, (0, 0, 0), (0, 1, 0))[0] == pytest.approx(expected, rel=1e-2)
+    assert factor(lamp, (0, 0, 0), (0, 1, 0))[0] == pytest.approx(expected, rel=2e-3)
 
 
 @pytest.mark.parametrize("elevation", [90, 40, 12, 5, 0, -8, -25])
