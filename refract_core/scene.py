@@ -7,6 +7,7 @@ Every record pickles.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import IntEnum
 
@@ -170,6 +171,8 @@ class LightKind(IntEnum):
     DISK = 3, "DiskLight"
     CAMERA = 4, "", False
     """Stands in where a stage has no light: at the eye, without falloff. Nothing it lights is in a shadow."""
+    CYLINDER = 5, "CylinderLight"
+    """Its axis is the light's X. It shines outward, but not from its ends."""
 
     usd_type: str
     """Its prim type in UsdLux; '' for none."""
@@ -183,6 +186,41 @@ class LightKind(IntEnum):
 
 
 @dataclass(frozen=True)
+class Shaping:
+    """How a light's radiance hangs on the direction in which it leaves, and on the place on the light: UsdLux
+    ShapingAPI, and the texture of a RectLight. The defaults leave it even."""
+
+    focus: float = 0.0
+    """Power of the cosine to the light's axis."""
+    focus_tint: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """What is left where that is 0."""
+    cone: float = math.pi
+    """Half angle beyond which nothing leaves [rad]."""
+    softness: float = 0.0
+    """Share of the cone over which it fades, 0 .. 1."""
+    profile: F32 | None = None
+    """shape (R, C): factor by direction. Rows from along the light's axis (-Z) to against it, evenly; columns around
+    it, from +X by +Y, evenly, the last one the first again. One column: the same all around."""
+    picture: F32 | None = None
+    """shape (H, W, 3): factor by place on a rectangle, linear; row 0 at +Y, column 0 at +X, so that who stands before
+    the light sees it upright."""
+
+
+@dataclass(frozen=True)
+class Shadow:
+    """UsdLux ShadowAPI. The defaults are those of light itself."""
+
+    color: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Share of the light that arrives where it is hidden."""
+    distance: float = math.inf
+    """What is farther from a surface casts no shadow on it [m]."""
+    falloff: float = 0.0
+    """Shadows fade over this last part of it [m]."""
+    gamma: float = 1.0
+    """Power of the share that is left of `falloff`."""
+
+
+@dataclass(frozen=True)
 class Light:
     """A finite or distant light. Emits along -Z of its own frame, as UsdLux."""
 
@@ -190,13 +228,23 @@ class Light:
     kind: LightKind
     radiance: tuple[float, float, float]
     """color * intensity * 2^exposure * temperature, after `normalize`. For a zero-size (point or zero-angle) light,
-    the intensity [radiance * m^2] or irradiance it is the limit of."""
+    the intensity [radiance * m^2] or irradiance it is the limit of; for a cylinder without radius, radiance times its
+    width [radiance * m]."""
     world_from_light: F64 = field(default_factory=lambda: np.eye(4))
     """shape (4, 4), column vectors, rotation and translation only [m]"""
     size: tuple[float, float] = (0.0, 0.0)
-    """Rect: width, height [m]; Disk, Sphere: radius [m], 0 (world scale applied); Distant: angle [rad], 0."""
+    """Rect: width, height [m]; Disk, Sphere: radius [m], 0 (world scale applied); Distant: angle [rad], 0;
+    Cylinder: radius, length [m]."""
     diffuse: float = 1.0
     specular: float = 1.0
+    shaping: Shaping = Shaping()
+    """Not for distant lights."""
+    casts_shadow: bool = True
+    shadow: Shadow = Shadow()
+    lit: tuple[str, ...] | None = None
+    """Paths of the prims it lights (the `lightLink` collection); None means everything."""
+    casters: tuple[str, ...] | None = None
+    """Paths of the prims that cast its shadows (`shadowLink`); None means everything."""
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,8 @@ from refract_core.scene import (
     Model,
     Param,
     Scene,
+    Shadow,
+    Shaping,
     Source,
     Sphere,
     Texture,
@@ -332,7 +334,7 @@ def _lights(dice: Dice) -> tuple[Light, ...]:
     lights = []
     for _ in range(dice.pick([1, 1, 2, 3])):
         # The camera's light is a kind for kernels; a scene asks for it by `camera_light`.
-        kind = dice.pick([kind for kind in LightKind if kind is not LightKind.CAMERA])
+        kind = dice.pick([LightKind.DISTANT, LightKind.SPHERE, LightKind.RECT, LightKind.DISK])
         place = np.array([dice.number(-1.5, 1.5), dice.number(1.2, 2.5), dice.number(-1.0, 2.0)])
         sizes = {LightKind.DISTANT: (dice.pick([0.0, 0.02, 0.2]), 0.0), LightKind.RECT: (dice.number(0.2, 1.0), 0.4)}
         size = sizes.get(kind, (dice.pick([0.0, 0.15, 0.4]), 0.0))
@@ -341,6 +343,32 @@ def _lights(dice: Dice) -> tuple[Light, ...]:
         r, g, b = (r * dice.number(0.5, 1.0) for r in one.radiance)
         lights.append(replace(one, radiance=(r, g, b), diffuse=dice.pick([1.0, 0.6]), specular=dice.pick([1.0, 0.5])))
     return tuple(lights)
+
+
+def _shaped(dice: Dice, one: Light, paths: list[str]) -> Light:
+    """A light as it may be authored: of another kind, uneven, with odd shadows, linked. Its own dice."""
+    if dice.chance(0.25) and one.kind is not LightKind.DISTANT:
+        one = replace(one, kind=LightKind.CYLINDER, size=(min(one.size[0], 0.15), dice.number(0.3, 1.2)))
+    chosen: dict[str, Any] = {}
+    if dice.chance(0.3):
+        chosen |= {"cone": math.radians(dice.number(15.0, 60.0)), "softness": dice.pick([0.0, 0.3, 1.0])}
+    if dice.chance(0.2):
+        chosen |= {"focus": dice.number(0.5, 6.0), "focus_tint": dice.pick([(0.0, 0.0, 0.0), (0.2, 0.5, 1.0)])}
+    if dice.chance(0.2):
+        profile = dice.rng.uniform(0.0, 2.0, (7, dice.pick([1, 5]))).astype(np.float32)
+        profile[:, -1] = profile[:, 0]
+        chosen["profile"] = profile
+    if dice.chance(0.5) and one.kind is LightKind.RECT:
+        chosen["picture"] = dice.rng.uniform(0.0, 2.0, (3, 5, 3)).astype(np.float32)
+    if one.kind is not LightKind.DISTANT:
+        one = replace(one, shaping=Shaping(**chosen))
+    if dice.chance(0.3):
+        distance = dice.pick([math.inf, 0.5, 1.5])
+        fade = dice.pick([0.0, 0.4]) if distance < math.inf else 0.0
+        one = replace(one, shadow=Shadow(dice.pick([(0.0,) * 3, (0.1, 0.3, 0.6)]), distance, fade, dice.number(0.5, 2)))
+    one = replace(one, casts_shadow=dice.chance(0.9))
+    some = tuple(path for path in paths if dice.chance(0.7))
+    return replace(one, lit=some if dice.chance(0.15) else None, casters=some if dice.chance(0.15) else None)
 
 
 def _camera(dice: Dice) -> Camera:
@@ -369,6 +397,9 @@ def random_scene(seed: int, standing: bool = True) -> Scene:
         made.thing(_opaque(dice), dice.number(-0.3, 0.5))
     environment = sky(dice.pick(range(_SKIES))) if dice.chance(0.6) else None
     lights = _lights(dice) if dice.chance(0.8) else ()
+    dice_of_lights = Dice(seed + 10**6)
+    paths = [thing.path for thing in made.meshes] + [ball.path for ball in made.spheres]
+    lights = tuple(_shaped(dice_of_lights, one, paths) for one in lights)
     lens = _camera(dice)
     if dice.chance(0.2):
         made.around(lens.world_from_camera[:3, 3])

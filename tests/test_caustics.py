@@ -20,7 +20,7 @@ from refract_core.rendering.caustics import caustics_of, plan_caustics
 from refract_core.rendering.work import Work
 from refract_core.scene import LightKind, Material, Mesh, Model, Scene, Sphere
 from refract_core.world import environment, textures
-from refract_core.world.lights import pack_lights
+from refract_core.world.lamps import pack_lights
 from refract_core.world.tables import pack_geometry, pack_materials, world_of
 
 F64 = NDArray[np.float64]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,10 @@ from scenes import box, camera, draw, light, material, quad, scene
 
 from refract_core.kernels.compile import kernel
 from refract_core.kernels.pointer import Pointer
-from refract_core.scene import Light, LightKind, Mesh, Model, Scene
-from refract_core.world.lights import _angle_over_sine, irradiance_factor, pack_lights
+from refract_core.scene import Light, LightKind, Mesh, Model, Scene, Shadow, Shaping
+from refract_core.world.lamps import _picture_levels, pack_lights
+from refract_core.world.lights import _angle_over_sine, irradiance_factor
+from refract_core.world.shaping import shape_matt
 
 F64 = NDArray[np.float64]
 
@@ -86,10 +89,10 @@ def test_rect_equals_quadrature(point: tuple[float, ...], normal: tuple[float, .
 
 @pytest.mark.parametrize(("point", "normal"), PLACES)
 def test_disk_equals_quadrature(point: tuple[float, ...], normal: tuple[float, ...]) -> None:
-    """The engine's twelve-gon has the disk's area, so only its outline differs: under a hundredth near by."""
+    """The engine's twelve-gon has the disk's area, so only its outline differs."""
     lamp = light(LightKind.DISK, (0, 2, 0), (0.3, -1, 0.2), (0.6, 0))
     expected = flat_quadrature(lamp, disk_samples(0.6), np.array(point), np.array(normal))
-    assert factor(lamp, point, normal)[0] == pytest.approx(expected, rel=1e-2, abs=1e-3)
+    assert factor(lamp, point, normal)[0] == pytest.approx(expected, rel=2e-3, abs=2e-4)
 
 
 @pytest.mark.parametrize("height", [0.2, 1.0, 5.0])
@@ -97,7 +100,7 @@ def test_disk_overhead_is_the_textbook_ratio(height: float) -> None:
     """E / L = pi r^2 / (r^2 + h^2) under the middle of a disk (any radiometry text)."""
     lamp = light(LightKind.DISK, (0, height, 0), (0, -1, 0), (0.6, 0))
     expected = math.pi * 0.36 / (0.36 + height**2)
-    assert factor(lamp, (0, 0, 0), (0, 1, 0))[0] == pytest.approx(expected, rel=1e-2)
+    assert factor(lamp, (0, 0, 0), (0, 1, 0))[0] == pytest.approx(expected, rel=2e-3)
 
 
 @pytest.mark.parametrize("elevation", [90, 40, 12, 5, 0, -8, -25])
@@ -234,3 +237,335 @@ def test_an_angle_over_its_sine() -> None:
     found = np.empty_like(angles)
     _angles(np.cos(angles), found)
     assert found == pytest.approx(angles / np.sin(angles), rel=1e-7)
+
+
+# --- Cylinders ------------------------------------------------------------------------------------------------------
+
+
+def tube(radius: float, length: float, centre: ArrayLike = (0, 2, 0), face: ArrayLike = (0.3, -1, 0.2)) -> Light:
+    return light(LightKind.CYLINDER, centre, face, (radius, length))
+
+
+def tube_quadrature(of: Light, point: ArrayLike, normal: ArrayLike) -> float:
+    """Sum of cos_receiver cos_emitter / d^2 dA over 600 x 600 places of the round of a cylinder."""
+    m, (radius, length) = of.world_from_light, of.size
+    x, phi = np.meshgrid((np.arange(600) + 0.5) / 600 - 0.5, (np.arange(600) + 0.5) / 600 * 2 * np.pi)
+    out = np.stack([0 * phi.ravel(), np.cos(phi).ravel(), np.sin(phi).ravel()], 1) @ m[:3, :3].T
+    to = m[:3, 3] + x.ravel()[:, None] * length * m[:3, 0] + out * radius - np.asarray(point)
+    d2 = (to * to).sum(1)
+    n = np.asarray(normal, np.float64)
+    receiver = np.maximum(to @ (n / np.linalg.norm(n)), 0)
+    emitter = np.maximum(-(to * out).sum(1), 0)
+    return float((receiver * emitter / d2**2).mean() * 2 * np.pi * radius * length)
+
+
+TUBE_PLACES = [
+    ((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+    ((1.5, 0.3, -0.7), (0.2, 1.0, 0.4)),
+    ((2.0, 1.8, 0.0), (0.1, 1.0, 0.2)),  # beyond its end
+    ((2.0, 1.8, 0.0), (-1.0, 0.2, 0.2)),
+    ((0.2, 1.5, 0.3), (0.0, 1.0, 0.0)),
+    ((0.2, 1.9, 0.5), (1.0, 0.3, 0.0)),  # the horizon cuts it along
+    ((-0.5, 3.0, 0.4), (0.2, -0.1, -1.0)),
+    ((3.0, 4.0, -5.0), (-1.0, -1.0, 2.0)),
+]
+
+
+@pytest.mark.parametrize(("radius", "length"), [(0.25, 1.6), (0.05, 1.0), (0.3, 0.2)])
+@pytest.mark.parametrize(("point", "normal"), TUBE_PLACES)
+def test_cylinder_equals_quadrature(
+    radius: float, length: float, point: tuple[float, ...], normal: tuple[float, ...]
+) -> None:
+    lamp = tube(radius, length)
+    expected = tube_quadrature(lamp, point, normal)
+    assert factor(lamp, point, normal)[0] == pytest.approx(expected, rel=5e-3, abs=5e-4)
+
+
+@pytest.mark.parametrize(("point", "normal"), TUBE_PLACES)
+def test_a_line_is_the_limit_of_thin_cylinders(point: tuple[float, ...], normal: tuple[float, ...]) -> None:
+    """Per radiance times width: a hair of 1 mm shows 2 mm of width."""
+    thin = tube_quadrature(tube(1e-3, 1.6), point, normal) / 2e-3
+    assert factor(tube(0.0, 1.6), point, normal)[0] == pytest.approx(thin, rel=5e-3, abs=1e-6)
+
+
+@pytest.mark.parametrize("height", [0.1, 1.0, 4.0])
+def test_an_endless_line_is_the_textbook_one(height: float) -> None:
+    """Of an infinite line, per radiance times width, at distance h: the integral of h^2 / (h^2 + t^2)^2, pi / 2 h."""
+    assert factor(tube(0.0, 1e4, (0, height, 0), (0, -1, 0)), (0, 0, 0), (0, 1, 0))[0] == pytest.approx(
+        math.pi / (2 * height), rel=1e-6
+    )
+
+
+@pytest.mark.parametrize("place", [(0.0, 2.0, 0.0), (3.0, 2.1, 0.0), (-0.2, 2.0, 0.1)])
+def test_ends_and_inside_of_a_cylinder_are_dark(place: tuple[float, ...]) -> None:
+    """UsdLuxCylinderLight: it shines outward, and not from its end caps."""
+    lamp = tube(0.3, 1.0, face=(0, -1, 0))
+    for normal in ((1.0, 0, 0), (-1.0, 0, 0), (0, 1.0, 0), (0, -1.0, 0)):
+        assert factor(lamp, place, normal)[0] == 0.0
+
+
+# --- Shaped lights --------------------------------------------------------------------------------------------------
+
+
+@kernel
+def _shaped(lights, points, normals, out):  # type: ignore[no-untyped-def]
+    for i in range(points.shape[0]):
+        p = (points[i, 0], points[i, 1], points[i, 2])
+        n = (normals[i, 0], normals[i, 1], normals[i, 2])
+        even = irradiance_factor(lights, 0, p, n)
+        tint = shape_matt(lights, 0, p, n)
+        for c in range(3):
+            out[i, c] = even * tint[c]
+
+
+def shaped_factor(of: Light, points: ArrayLike, normals: ArrayLike) -> F64:
+    """Irradiance per radiance of one light and colour, with its shaping; shape (N, 3)."""
+    p, n = np.atleast_2d(np.asarray(points, np.float64)), np.atleast_2d(np.asarray(normals, np.float64))
+    out = np.empty((len(p), 3))
+    table = pack_lights(Scene((), (), lights=(of,)), np.zeros(3))
+    _shaped(Pointer(table), p, n / np.linalg.norm(n, axis=1, keepdims=True), out)
+    return out
+
+
+def surface(of: Light) -> tuple[F64, F64, float]:
+    """65 536 places spread evenly over a light, in its own frame: points, normals, and the area of each."""
+    m = 256
+    u, v = (a.ravel() for a in np.meshgrid((np.arange(m) + 0.5) / m, (np.arange(m) + 0.5) / m))
+    a, b = of.size
+    down = np.broadcast_to([0.0, 0.0, -1.0], (m * m, 3))
+    if of.kind is LightKind.RECT:
+        return np.stack([(u - 0.5) * a, (v - 0.5) * b, 0 * u], 1), down, a * b / m**2
+    if of.kind is LightKind.DISK:
+        r, t = a * np.sqrt(u), 2 * np.pi * v
+        return np.stack([r * np.cos(t), r * np.sin(t), 0 * u], 1), down, np.pi * a * a / m**2
+    if of.kind is LightKind.SPHERE:
+        z, t = 2 * u - 1, 2 * np.pi * v
+        s = np.sqrt(1 - z * z)
+        out = np.stack([s * np.cos(t), s * np.sin(t), z], 1)
+        return a * out, out, 4 * np.pi * a * a / m**2
+    t = 2 * np.pi * v
+    out = np.stack([0 * t, np.cos(t), np.sin(t)], 1)
+    return a * out + np.stack([(u - 0.5) * b, 0 * u, 0 * u], 1), out, 2 * np.pi * a * b / m**2
+
+
+def usdlux_share(of: Light, places: F64, leaving: F64) -> F64:
+    """What UsdLux leaves of the radiance at `places`, in unit directions `leaving`, all in the light's frame."""
+    shaping = of.shaping
+    cosine = -leaving[:, 2]
+    off = np.arccos(np.clip(cosine, -1, 1))
+    share = np.ones((len(leaving), 3))
+    if shaping.focus > 0:
+        factor = np.abs(cosine) ** shaping.focus
+        share = np.array(shaping.focus_tint) * (1 - factor[:, None]) + factor[:, None]
+    start = shaping.cone * (1 - shaping.softness)
+    if shaping.softness > 0:
+        x = np.clip((off - start) / (shaping.cone - start), 0, 1)
+        share = share * (1 - x * x * (3 - 2 * x))[:, None]
+    share[off > shaping.cone] = 0
+    if shaping.profile is not None:
+        rows, columns = shaping.profile.shape
+        y = off / np.pi * (rows - 1)
+        x = np.arctan2(leaving[:, 1], leaving[:, 0]) / (2 * np.pi) % 1.0 * (columns - 1)
+        j, i = np.minimum(y.astype(int), rows - 2), np.minimum(x.astype(int), max(columns - 2, 0))
+        k = np.minimum(i + 1, columns - 1)
+        top = shaping.profile[j, i] * (1 - x + i) + shaping.profile[j, k] * (x - i)
+        bottom = shaping.profile[j + 1, i] * (1 - x + i) + shaping.profile[j + 1, k] * (x - i)
+        share = share * (top * (1 - y + j) + bottom * (y - j))[:, None]
+    if shaping.picture is not None:  # its first corner at +x +y, its last at -x -y
+        height, width = shaping.picture.shape[:2]
+        column = np.clip(((0.5 - places[:, 0] / of.size[0]) * width).astype(int), 0, width - 1)
+        row = np.clip(((0.5 - places[:, 1] / of.size[1]) * height).astype(int), 0, height - 1)
+        share = share * shaping.picture[row, column]
+    return share
+
+
+def shaped_quadrature(of: Light, point: ArrayLike, normal: ArrayLike) -> F64:
+    """Sum of share cos_receiver cos_emitter / d^2 dA over the light; a point's intensity over the square."""
+    m = of.world_from_light
+    n = np.asarray(normal, np.float64) / np.linalg.norm(normal)
+    if of.size == (0.0, 0.0):
+        to = m[:3, 3] - np.asarray(point)
+        d = np.linalg.norm(to)
+        share = usdlux_share(of, np.zeros((1, 3)), (-to / d @ m[:3, :3])[None])[0]
+        return np.asarray(share * max(0.0, to @ n / d) / d**2)
+    places, normals, area = surface(of)
+    to = places @ m[:3, :3].T + m[:3, 3] - np.asarray(point)
+    d = np.linalg.norm(to, axis=1)
+    receiver = np.maximum(to @ n / d, 0)
+    leaving = -(to @ m[:3, :3]) / d[:, None]
+    emitter = np.maximum((leaving * normals).sum(1), 0)
+    weight = receiver * emitter / d**2 * area
+    return np.asarray((usdlux_share(of, places, leaving) * weight[:, None]).sum(0))
+
+
+def _measured(columns: int) -> NDArray[np.float32]:
+    """A profile of 10 degrees by 60: a beam that is no circle."""
+    off = np.radians(np.arange(0, 181, 10))[:, None]
+    around = np.linspace(0, 2 * np.pi, columns)[None, :] if columns > 1 else np.zeros((1, 1))
+    return np.asarray(np.clip(np.cos(off * (1.0 + 0.3 * np.cos(2 * around))), 0, None) * 2.0, np.float32)
+
+
+def _painting() -> NDArray[np.float32]:
+    """Colours of 8 x 4 texels with one bright one; no symmetry."""
+    picture = np.random.default_rng(3).uniform(0.0, 1.0, (4, 8, 3)).astype(np.float32)
+    picture[1, 6] = (4.0, 2.0, 0.5)
+    return picture
+
+
+LAMPS = {
+    "rect": light(LightKind.RECT, (0, 2, 0), (0.1, -1, 0.05), (0.8, 0.5)),
+    "disk": light(LightKind.DISK, (0, 2, 0), (0.1, -1, 0.05), (0.3, 0)),
+    "sphere": light(LightKind.SPHERE, (0, 2, 0), (0.1, -1, 0.05), (0.25, 0)),
+    "point": light(LightKind.SPHERE, (0, 2, 0), (0.1, -1, 0.05), (0.0, 0)),
+    "cylinder": light(LightKind.CYLINDER, (0, 2, 0), (0.1, -1, 0.05), (0.08, 0.9)),
+}
+SHAPINGS = {
+    "spot": Shaping(cone=math.radians(30)),
+    "soft": Shaping(cone=math.radians(40), softness=0.6),
+    "little soft": Shaping(cone=math.radians(40), softness=0.05),
+    "focus": Shaping(focus=8.0),
+    "tinted": Shaping(focus=3.0, focus_tint=(0.1, 0.5, 1.0)),
+    "measured": Shaping(profile=_measured(7)),
+    "round": Shaping(profile=_measured(1), cone=math.radians(50), softness=0.2),
+}
+
+
+@pytest.mark.parametrize("lamp", LAMPS)
+@pytest.mark.parametrize("shaping", SHAPINGS)
+def test_a_shaped_light_equals_quadrature(lamp: str, shaping: str) -> None:
+    """On a floor under it, out of its cone, and near to it; upright and tilted. Within a fiftieth of what the light
+    brings there without shaping where a cone's edge cuts it, and a three-hundredth on an average."""
+    of = replace(LAMPS[lamp], shaping=SHAPINGS[shaping])
+    places = [(x, y, 0.2 * x) for y in (0.0, 1.2) for x in np.linspace(-1.6, 1.6, 9)]
+    normals = [(0.0, 1.0, 0.0), (0.5, 1.0, -0.3)]
+    errors = []
+    for normal in normals:
+        found = shaped_factor(of, places, [normal] * len(places))
+        even = factor(of, places, [normal] * len(places))
+        for k, place in enumerate(places):
+            if even[k] > 1e-6:
+                errors.append(np.abs(found[k] - shaped_quadrature(of, place, normal)).max() / even[k])
+    assert max(errors) < 2e-2
+    assert np.mean(errors) < 3e-3
+
+
+@pytest.mark.parametrize("height", [0.4, 1.0, 3.0])
+@pytest.mark.parametrize("normal", [(0.0, 1.0, 0.0), (1.0, 0.4, 0.2)])
+def test_a_picture_on_a_rectangle_equals_quadrature(height: float, normal: tuple[float, ...]) -> None:
+    """Of every colour, within half a hundredth of the light: a texel of 8 x 4 is one bright spot of a panel."""
+    of = light(LightKind.RECT, (0.2, height, 0.1), (0.1, -1, 0.05), (1.6, 0.9))
+    of = replace(of, shaping=Shaping(picture=_painting()))
+    for place in ((0.0, 0.0, 0.0), (0.7, 0.0, -0.3), (-1.5, 0.0, 0.5)):
+        expected = shaped_quadrature(of, place, normal)
+        assert shaped_factor(of, place, normal)[0] == pytest.approx(expected, rel=5e-3, abs=5e-4)
+
+
+def test_a_light_before_which_a_cone_ends_asks_for_no_rays() -> None:
+    lamp = replace(LAMPS["disk"], shaping=Shaping(cone=0.2))
+    assert (shaped_factor(lamp, (1.5, 0, 0), (0, 1, 0)) == 0).all()
+
+
+def test_the_picture_on_a_light_is_its_own_mean() -> None:
+    """Levels of squares keep what a picture of any size holds; NaN is black."""
+    picture = np.random.default_rng(5).uniform(0, 2, (37, 90, 3)).astype(np.float32)
+    picture[3, 4] = np.nan
+    levels = _picture_levels(picture)
+    assert [len(level) for level in levels] == [1, 2, 4, 8, 16, 32, 64, 128]
+    for level in levels:
+        np.testing.assert_allclose(level.mean((0, 1)), np.nan_to_num(picture).mean((0, 1)), rtol=1e-4)
+
+
+# --- Shadows and links in a picture ---------------------------------------------------------------------------------
+
+CARD = [(-0.5, 1, 0.5), (0.5, 1, 0.5), (0.5, 1, -0.5), (-0.5, 1, -0.5)]
+
+
+def under_the_card(lamp: Light, **settings: Any) -> tuple[F64, F64]:
+    """Light on the floor in the deep of the card's shadow, and what would be there without it; shape (3,)."""
+    planes = draw(look_down((lamp,), (quad("/card", CARD),)), 64, 64, **settings)
+    free = draw(look_down((lamp,)), 64, 64, **settings)
+    place = planes["P"]
+    deep = (place[..., 1] < 0.5) & (np.abs(place[..., [0, 2]]).max(-1) < 0.45)
+    assert deep.sum() > 20
+    return planes["beauty"][deep][:, :3].astype(np.float64).mean(0), free["beauty"][deep][:, :3].mean(0)
+
+
+POINT = light(LightKind.SPHERE, (0, 3, 0), (0, -1, 0), (0.0, 0))
+
+
+@pytest.mark.parametrize("samples", [1, 4])
+def test_a_light_without_shadows_shines_through(samples: int) -> None:
+    found, free = under_the_card(replace(POINT, casts_shadow=False), samples=samples)
+    np.testing.assert_allclose(found, free, rtol=1e-5)
+
+
+@pytest.mark.parametrize("samples", [1, 4])
+def test_a_shadow_has_its_colour(samples: int) -> None:
+    found, free = under_the_card(replace(POINT, shadow=Shadow(color=(0.1, 0.0, 0.5))), samples=samples)
+    np.testing.assert_allclose(found, free * (0.1, 0.0, 0.5), rtol=1e-5, atol=1e-7)
+
+
+def test_what_is_too_far_casts_no_shadow() -> None:
+    """The card is 1 m above the floor, and a little more along a slanted ray."""
+    found, free = under_the_card(replace(POINT, shadow=Shadow(distance=0.98)))
+    np.testing.assert_allclose(found, free, rtol=1e-5)
+    assert under_the_card(replace(POINT, shadow=Shadow(distance=1.2)))[0].max() == 0.0
+
+
+@pytest.mark.parametrize("gamma", [0.5, 1.0, 3.0])
+def test_a_shadow_fades_over_its_falloff(gamma: float) -> None:
+    """A sun above: the card is 1 m from every place, half way into the falloff from 0.5 to 1.5."""
+    sun = light(LightKind.DISTANT, (0, 9, 0), (0, -1, 0), (0.0, 0))
+    sun = replace(sun, shadow=Shadow(distance=1.5, falloff=1.0, gamma=gamma))
+    found, free = under_the_card(sun, samples=64, tolerance=0.0)
+    assert found / free == pytest.approx(np.full(3, 1.0 - 0.5**gamma), abs=0.02)
+
+
+@pytest.mark.parametrize("samples", [1, 4])
+def test_a_light_lights_what_it_is_linked_to(samples: int) -> None:
+    left = quad("/left", [(-9, 0, 9), (0, 0, 9), (0, 0, -9), (-9, 0, -9)])
+    right = quad("/right", [(0, 0, 9), (9, 0, 9), (9, 0, -9), (0, 0, -9)])
+    glossy = material("/glossy", DIFFUSE=0.5, IOR=1.5, ROUGHNESS=0.3, CLEARCOAT=1.0)
+
+    def picture(lit: tuple[str, ...] | None) -> dict[str, NDArray[np.float32]]:
+        lamp = replace(light(LightKind.RECT, (0, 2, -1), (0, -1, 0), (0.5, 0.5), 4.0), lit=lit)
+        eye = camera((0, 4, 3), (0, 0, 0))
+        return draw(scene([left, right], [glossy], lights=(lamp,), cameras=(eye,)), 32, 32, samples=samples)
+
+    whole, some = picture(None), picture(("/left",))
+    on_left = whole["P"][..., 0] < -0.3
+    np.testing.assert_array_equal(some["beauty"][on_left], whole["beauty"][on_left])
+    assert some["beauty"][whole["P"][..., 0] > 0.3][:, :3].max() == 0.0
+    assert whole["beauty"][..., :3].min() > 0.0
+
+
+@pytest.mark.parametrize("samples", [1, 4])
+def test_only_those_cast_shadows_that_a_light_names(samples: int) -> None:
+    """Two cards side by side; the light knows of one, another light of both."""
+    cards = [quad(f"/card{k}", np.array(CARD) + np.array([1.2 * k - 0.6, 0, 0])) for k in range(2)]
+
+    def shadows(casters: tuple[str, ...] | None) -> list[bool]:
+        lamp = replace(light(LightKind.DISTANT, (0, 9, 0), (0, -1, 0), (0.0, 0)), casters=casters)
+        planes = draw(look_down((lamp,), tuple(cards)), 96, 96, samples=samples)
+        p = planes["P"]
+        under = [(p[..., 1] < 0.5) & (np.abs(p[..., 0] - 1.2 * k + 0.6) < 0.4) & (np.abs(p[..., 2]) < 0.4)
+                 for k in range(2)]  # fmt: skip
+        return [bool((planes["beauty"][mask][:, 0] == 0.0).all()) for mask in under]
+
+    assert shadows(None) == [True, True]
+    assert shadows(("/card1",)) == [False, True]
+    assert shadows(()) == [False, False]
+
+
+@pytest.mark.parametrize("kind", [LightKind.RECT, LightKind.CYLINDER])
+def test_a_mirror_shows_the_light_itself(kind: LightKind) -> None:
+    """A polished floor under a light: its picture is the light's own, of its radiance; a cone shuts it off."""
+    of = light(kind, (0, 2, 0), (0, -1, 0), (1.0, 0.6) if kind is LightKind.RECT else (0.2, 1.0), 3.0)
+    mirror = material("/mirror", DIFFUSE=1.0, METALLIC=1.0, ROUGHNESS=0.0)
+    eye = camera((0, 4, 2), (0, 0, 0))
+    bright = draw(scene([quad("/floor", FLOOR)], [mirror], lights=(of,), cameras=(eye,)), 64, 64)["beauty"][..., 0]
+    assert bright.max() == pytest.approx(3.0, rel=0.02)
+    assert 0.003 < (bright > 1.5).mean() < 0.2
+    narrow = replace(of, shaping=Shaping(cone=math.radians(2)))
+    dark = draw(scene([quad("/floor", FLOOR)], [mirror], lights=(narrow,), cameras=(eye,)), 64, 64)["beauty"][..., 0]
+    assert dark.max() == 0.0

@@ -164,6 +164,18 @@ def test_the_scenes_hold_something_of_everything() -> None:
     assert {w for s in sources if s.texture >= 0 for w in s.wrap} == set(Wrap)
     assert {s.channel for s in sources if s.texture >= 0} == set(Channel)
     assert {light.kind for s in scenes for light in s.lights} == set(LightKind) - {LightKind.CAMERA}
+    lamps = [light for s in scenes for light in s.lights]
+    shapings = [light.shaping for light in lamps]
+    assert any(s.cone < 1.0 and s.softness == 0.0 for s in shapings)
+    assert any(s.cone < 1.0 and s.softness == 1.0 for s in shapings)
+    assert any(s.focus > 0.0 for s in shapings)
+    assert {s.profile.shape[1] for s in shapings if s.profile is not None} == {1, 5}
+    assert any(s.picture is not None for s in shapings)
+    assert any(max(light.shadow.color) > 0.0 for light in lamps)
+    assert any(light.shadow.falloff > 0.0 for light in lamps)
+    assert {light.casts_shadow for light in lamps} == {True, False}
+    assert any(light.lit is not None for light in lamps)
+    assert any(light.casters is not None for light in lamps)
     assert {s.environment is None for s in scenes} == {True, False}
     assert {s.cameras[0].orthographic for s in scenes} == {True, False}
     assert len({m.priority for m in materials if m.refractive}) > 3

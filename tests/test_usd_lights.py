@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +13,12 @@ import pytest
 from numpy.typing import NDArray
 from pxr import Usd, UsdLux
 
-from refract_core.scene import Environment, Light, LightKind, Notice
+from refract_core.scene import Environment, Light, LightKind, Notice, Param
 from refract_core.usd.lights.domes import directions, linear, lookup
+from refract_core.usd.lights.ies import Ies, parse, profile
 from refract_core.usd.lights.read import read_lights
 from refract_core.usd.materials.textures import read_texture
+from refract_core.usd.stage import scene_from_stage
 
 IDENTITY = np.eye(4)
 Read = tuple[tuple[Light, ...], Environment | None, list[Notice]]
@@ -196,18 +200,17 @@ def test_invisible_lights_and_other_purposes_are_left_out() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ('def CylinderLight "L" {}', "CylinderLight"),
         ('def GeometryLight "L" {}', "GeometryLight"),
         ('def PortalLight "L" {}', "PortalLight"),
         ('def PluginLight "L" {}', "PluginLight"),
         ('def Mesh "L" (prepend apiSchemas = ["MeshLightAPI"]) {}', "MeshLightAPI"),
-        ('def RectLight "L" { asset inputs:texture:file = @x.png@; }', "inputs:texture:file"),
-        ('def SphereLight "L" (prepend apiSchemas = ["ShapingAPI"]) { float inputs:shaping:cone:angle = 99; }', "cone"),
-        ('def RectLight "L" (prepend apiSchemas = ["ShapingAPI"]) { float inputs:shaping:focus = 2; }', "focus"),
+        ('def RectLight "L" { asset inputs:texture:file = @x.png@; }', "x.png"),
         ('def RectLight "L" (prepend apiSchemas = ["ShapingAPI"]) { asset inputs:shaping:ies:file = @a.ies@; }', "ies"),
-        ('def RectLight "L" (prepend apiSchemas = ["ShadowAPI"]) { bool inputs:shadow:enable = 0; }', "shadow:enable"),
-        ('def RectLight "L" { uniform bool collection:lightLink:includeRoot = 0; }', "lightLink"),
-        ('def RectLight "L" { rel collection:shadowLink:excludes = </X>; }', "shadowLink"),
+        ('def DistantLight "L" (prepend apiSchemas = ["ShapingAPI"]) { float inputs:shaping:cone:angle = 9; }', "cone"),
+        ('def DistantLight "L" (prepend apiSchemas = ["ShapingAPI"]) { float inputs:shaping:focus = 2; }', "focus"),
+        ('def DomeLight "L" (prepend apiSchemas = ["ShadowAPI"]) { bool inputs:shadow:enable = 0; }', "shadow:enable"),
+        ('def DomeLight "L" { uniform bool collection:lightLink:includeRoot = 0; }', "lightLink"),
+        ('def DomeLight "L" { rel collection:shadowLink:excludes = </X>; }', "shadowLink"),
         ('def DomeLight "L" { float inputs:diffuse = 0; }', "inputs:diffuse"),
         ('def SphereLight "L" { double3 xformOp:scale = (1, 2, 1)\nuniform token[] xformOpOrder = ["xformOp:scale"]; }',
          "non-uniform"),
@@ -342,7 +345,6 @@ def test_an_eight_bit_dome_is_decoded_from_srgb(tmp_path: Path) -> None:
     ("inputs", "said"),
     [
         ("asset inputs:texture:file = @none.exr@", "none.exr"),
-        ('asset inputs:texture:file = @none.exr@\ntoken inputs:texture:format = "mirroredBall"', "mirroredBall"),
     ],
 )
 def test_a_dome_map_that_cannot_be_used_is_named_and_skipped(inputs: str, said: str) -> None:
@@ -387,3 +389,419 @@ def test_kinds_are_kept_apart() -> None:
     text = 'def DistantLight "A" {}\ndef SphereLight "B" {}\ndef RectLight "C" {}\ndef DiskLight "D" {}'
     kinds = [light.kind for light in read(text)[0]]
     assert kinds == [LightKind.DISTANT, LightKind.SPHERE, LightKind.RECT, LightKind.DISK]
+
+
+# --- Cylinders, shaping, shadows, links -----------------------------------------------------------------------------
+
+
+def test_a_cylinder_is_about_its_x_and_normalizes_by_its_round() -> None:
+    text = "float inputs:radius = 0.1\nfloat inputs:length = 3\nfloat inputs:intensity = 7\n"
+    assert one("CylinderLight").size == (0.5, 1.0)
+    assert one("CylinderLight", text).radiance[0] == 7.0
+    light = one("CylinderLight", text + "bool inputs:normalize = 1" + MOVED)
+    assert light.kind is LightKind.CYLINDER
+    assert light.size == pytest.approx((0.2, 6.0))
+    assert light.radiance[0] == pytest.approx(7 / (2 * math.pi * 0.2 * 6.0))
+    assert light.world_from_light[:3, 0] == pytest.approx([0, 0, -1], abs=1e-12)  # 90 degrees about Y
+
+
+@pytest.mark.parametrize("normalize", ["", "bool inputs:normalize = 1\n"])
+@pytest.mark.parametrize("metres_per_unit", [1.0, 0.01])
+def test_a_line_gives_the_light_of_the_tube_it_stands_for(normalize: str, metres_per_unit: float) -> None:
+    """Its radiance times width is that of the tube: 2 r L, whatever the units."""
+    scale = np.diag([metres_per_unit] * 3 + [1.0])
+    text = f"float inputs:radius = 0.2\nfloat inputs:length = 3\n{normalize}"
+    tube = one("CylinderLight", text, engine_from_stage=scale, metres_per_unit=metres_per_unit)
+    line = one("CylinderLight", text + "bool treatAsLine = 1", engine_from_stage=scale, metres_per_unit=metres_per_unit)
+    assert line.size == pytest.approx((0.0, 3.0 * metres_per_unit))
+    assert line.radiance[0] == pytest.approx(tube.radiance[0] * 2 * tube.size[0])
+
+
+SHAPED = '(prepend apiSchemas = ["ShapingAPI"])'
+
+
+def shaped(kind: str, inputs: str) -> Light:
+    lights, _, notices = read(f'def {kind} "L" {SHAPED}\n{{\n{inputs}\n}}')
+    assert not notices
+    return lights[0]
+
+
+def test_shaping_is_read() -> None:
+    shaping = shaped("RectLight", """
+        float inputs:shaping:cone:angle = 30
+        float inputs:shaping:cone:softness = 0.25
+        float inputs:shaping:focus = 4
+        color3f inputs:shaping:focusTint = (0, 0.5, 1)
+    """).shaping  # fmt: skip
+    assert shaping.cone == pytest.approx(math.radians(30))
+    assert (shaping.softness, shaping.focus, shaping.focus_tint) == (0.25, 4.0, (0.0, 0.5, 1.0))
+
+
+def test_the_schemas_cone_cuts_what_shines_backwards_only() -> None:
+    """ShapingAPI's own angle is 90 degrees: half of a sphere is dark, of a rectangle nothing."""
+    assert shaped("SphereLight", "").shaping.cone == pytest.approx(math.pi / 2)
+    assert shaped("RectLight", "").shaping.cone == math.pi
+    assert one("SphereLight").shaping.cone == math.pi
+
+
+def test_values_beyond_the_schemas_ranges_are_cut() -> None:
+    shaping = shaped("SphereLight", "float inputs:shaping:focus = -3\nfloat inputs:shaping:cone:softness = 7").shaping
+    assert (shaping.focus, shaping.softness) == (0.0, 1.0)
+
+
+def test_shadow_inputs_are_read_in_metres() -> None:
+    text = """(prepend apiSchemas = ["ShadowAPI"])
+    {
+        color3f inputs:shadow:color = (0.1, 0.2, 0.3)
+        float inputs:shadow:distance = 50
+        float inputs:shadow:falloff = 80
+        float inputs:shadow:falloffGamma = 2
+    }"""
+    scale = np.diag([0.01] * 3 + [1.0])
+    (light,), _, notices = read(f'def RectLight "L" {text}', engine_from_stage=scale, metres_per_unit=0.01)
+    assert not notices
+    assert light.casts_shadow
+    assert light.shadow.color == pytest.approx((0.1, 0.2, 0.3))
+    assert light.shadow.distance == pytest.approx(0.5)
+    assert light.shadow.falloff == pytest.approx(0.5)  # it cannot exceed the distance
+    assert light.shadow.gamma == 2.0
+    off = text.replace("color3f", "bool inputs:shadow:enable = 0\ncolor3f")
+    assert not read(f'def RectLight "L" {off}')[0][0].casts_shadow
+
+
+DRAWN = ("/Set/Wall", "/Set/Floor", "/Ball")
+
+
+def linked(text: str) -> Light:
+    stage = Usd.Stage.CreateInMemory()
+    stage.GetRootLayer().ImportFromString(f'#usda 1.0\ndef RectLight "L"\n{{\n{text}\n}}\n')
+    notices: list[Notice] = []
+    (light,), _ = read_lights(
+        stage, Usd.TimeCode(0.0), engine_from_stage=IDENTITY, metres_per_unit=1.0, purposes=("default",),
+        notices=notices, drawn=DRAWN,
+    )  # fmt: skip
+    assert not notices
+    return light
+
+
+def test_links_hold_what_their_collections_do() -> None:
+    assert linked("").lit is None
+    assert linked("").casters is None
+    only = "uniform bool collection:lightLink:includeRoot = 0\nrel collection:lightLink:includes = </Set>"
+    assert linked(only).lit == ("/Set/Wall", "/Set/Floor")
+    assert linked("rel collection:shadowLink:excludes = </Ball>").casters == ("/Set/Wall", "/Set/Floor")
+    assert linked("rel collection:shadowLink:excludes = </Elsewhere>").casters is None
+    assert linked("uniform bool collection:lightLink:includeRoot = 0").lit == ()
+
+
+def test_more_sets_of_casters_than_masks_are_named() -> None:
+    lamps = "\n".join(
+        f'def RectLight "L{k}" {{ rel collection:shadowLink:excludes = </P{k}>; }}' for k in range(6)
+    )
+    stage = Usd.Stage.CreateInMemory()
+    stage.GetRootLayer().ImportFromString(f"#usda 1.0\n{lamps}")
+    notices: list[Notice] = []
+    lights, _ = read_lights(
+        stage, Usd.TimeCode(0.0), engine_from_stage=IDENTITY, metres_per_unit=1.0, purposes=("default",),
+        notices=notices, drawn=[f"/P{k}" for k in range(6)],
+    )  # fmt: skip
+    assert [light.casters is None for light in lights] == [False] * 4 + [True] * 2
+    assert [notice.path for notice in notices] == ["/L4", "/L5"]
+
+
+# --- Measured profiles ----------------------------------------------------------------------------------------------
+
+
+def ies(vertical: Sequence[float], horizontal: Sequence[float], candela: Sequence[Sequence[float]], factor: float = 1.0,
+        kind: int = 1, tilt: str = "NONE") -> str:  # fmt: skip
+    """An LM-63-2002 file; `candela` by horizontal angle, then by vertical."""
+    rows = "\n".join(" ".join(f"{v:g}" for v in row) for row in candela)
+    return (
+        f"IESNA:LM-63-2002\n[TEST] made here\n[MANUFAC] nobody\nTILT={tilt}\n"
+        f"1 1000 {factor:g} {len(vertical)} {len(horizontal)} {kind} 2 0 0 0\n1.0 1.0 50\n"
+        f"{' '.join(map(str, vertical))}\n{', '.join(map(str, horizontal))}\n{rows}\n"
+    )
+
+
+def at(found: Ies, off: float, around: float) -> float:
+    """The profile at an angle from -Z and one from +X [degrees]."""
+    values = profile(found, 0.0, False)
+    row = off / 180.0 * (values.shape[0] - 1)
+    column = around % 360.0 / 360.0 * (values.shape[1] - 1)
+    assert row == int(row)
+    return float(values[int(row), round(column)])
+
+
+def test_a_round_profile_is_linear_between_its_angles_and_dark_beyond() -> None:
+    found = parse(ies([0, 30, 90], [0], [[100, 40, 10]], 2.0))
+    assert [at(found, off, 123.0) for off in (0, 15, 30, 60, 90, 91, 180)] == pytest.approx(
+        [200, 140, 80, 50, 20, 0, 0]
+    )
+
+
+def test_a_quarter_stands_for_all_four() -> None:
+    """Angles 0 .. 90: symmetric about both planes."""
+    found = parse(ies([0, 90], [0, 45, 90], [[1, 1], [1, 2], [1, 5]]))
+    for around, value in ((0, 1), (45, 2), (90, 5), (135, 2), (180, 1), (225, 2), (270, 5), (315, 2), (22.5, 1.5)):
+        assert at(found, 90, around) == pytest.approx(value)
+
+
+def test_a_half_stands_for_the_other_one() -> None:
+    """0 .. 180: symmetric about the plane of 0 and 180. 90 .. 270: about that of 90 and 270."""
+    found = parse(ies([0, 90], [0, 90, 180], [[1, 1], [1, 2], [1, 5]]))
+    for around, value in ((0, 1), (90, 2), (180, 5), (270, 2), (45, 1.5)):
+        assert at(found, 90, around) == pytest.approx(value)
+    found = parse(ies([0, 90], [90, 180, 270], [[1, 1], [1, 2], [1, 5]]))
+    for around, value in ((90, 1), (180, 2), (270, 5), (0, 2), (45, 1.5), (315, 3.5)):
+        assert at(found, 90, around) == pytest.approx(value)
+
+
+def test_all_around_is_as_it_is() -> None:
+    for angles, rows in (([0, 90, 180, 270, 360], [1, 2, 3, 4, 1]), ([0, 90, 180, 270], [1, 2, 3, 4])):
+        found = parse(ies([0, 180], angles, [[v, v] for v in rows]))
+        assert [at(found, 90, a) for a in (0, 90, 180, 270, 315)] == pytest.approx([1, 2, 3, 4, 2.5])
+
+
+def test_tilt_and_old_heads_are_passed_over() -> None:
+    included = ies([0, 90], [0], [[3, 1]], tilt="INCLUDE").replace("INCLUDE\n", "INCLUDE\n1\n2\n0 90\n1 0.8\n")
+    assert at(parse(included), 0, 0) == 3.0
+    old = "\n".join(ies([0, 90], [0], [[3, 1]]).split("\n")[1:])  # LM-63-1986 has no first line
+    assert at(parse(old), 0, 0) == 3.0
+
+
+def test_a_normalized_profile_keeps_the_lights_power() -> None:
+    """Its mean over the sphere is 1, or over the half that the file has; whatever its shape."""
+    for vertical, share in (([0, 20, 45, 90], 0.5), ([0, 20, 45, 90, 180], 1.0)):
+        candela = [[900, 500, 20, 5, 3][: len(vertical)], [900, 300, 40, 1, 3][: len(vertical)]]
+        values = profile(parse(ies(vertical, [0, 90], candela)), 0.0, True)
+        off = np.linspace(0, np.pi, len(values))
+        means = 0.5 * (values[:, 1:] + values[:, :-1]).mean(1)
+        assert np.trapezoid(means * np.sin(off), off) / 2 == pytest.approx(share, rel=1e-3)
+
+
+@pytest.mark.parametrize(("scale", "off", "read_at"), [
+    (0.5, 30, 60), (2.0, 60, 30), (0.0, 40, 40), (-0.5, 150, 120), (-2.0, 100, 140), (0.5, 120, 240),
+])  # fmt: skip
+def test_angle_scale_follows_usdlux(scale: float, off: int, read_at: int) -> None:
+    """theta / s for s > 0, (theta - pi) / -s + pi for s < 0; beyond the file's angles it is dark."""
+    found = parse(ies([0, 180], [0], [[0, 180]]))
+    assert profile(found, scale, False)[4 * off, 0] == pytest.approx(read_at if read_at <= 180 else 0.0)
+
+
+@pytest.mark.parametrize(("text", "said"), [
+    ("hello", "TILT"), (ies([0, 90], [0], [[1]]), "too soon"), (ies([0, 90], [0], [[1, 2]], kind=2), "type B"),
+    (ies([90, 0], [0], [[1, 2]]), "rise"), (ies([0, 90], [0, 70], [[1, 2], [1, 2]]).replace("0, 70", "5, 70"), "70"),
+    (ies([0, 90], [0], [[1, -2]]), "below 0"), (ies([0, 90], [0], [[1, 2]]).replace(" 2 1 1 2 ", " 2000000 9 1 2 "),
+     "2e+06"),
+])  # fmt: skip
+def test_a_file_that_is_no_profile_says_why(text: str, said: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(said)):
+        parse(text)
+
+
+def test_a_profile_of_a_light_is_read(tmp_path: Path) -> None:
+    file = tmp_path / "lamp.ies"
+    file.write_text(ies([0, 90], [0], [[100, 0]]))
+    light = shaped("SphereLight", f"asset inputs:shaping:ies:file = @{file}@\nfloat inputs:shaping:cone:angle = 180")
+    assert light.shaping.profile is not None
+    assert light.shaping.profile[0, 0] == 100.0
+    file.write_text("nothing")
+    (light,), _, notices = read(
+        f'def SphereLight "L" {SHAPED} {{ asset inputs:shaping:ies:file = @{file}@; }}'
+    )
+    assert light.shaping.profile is None
+    assert "TILT" in notices[0].text
+
+
+# --- Pictures on rectangles -----------------------------------------------------------------------------------------
+
+
+def test_the_first_pixel_of_a_picture_is_at_plus_x_plus_y(tmp_path: Path) -> None:
+    """UsdLuxRectLight. Who stands before the light, at -Z, has +X at the left: the picture is upright to them. Mirrored
+    by its transform, it is mirrored."""
+    path = tmp_path / "red.exr"
+    pixels = np.zeros((2, 2, 3), np.float32)
+    pixels[0, 0, 0] = 1.0
+    file = oiio.ImageOutput.create(str(path))
+    assert file is not None
+    assert file.open(str(path), oiio.ImageSpec(2, 2, 3, oiio.FLOAT))
+    assert file.write_image(pixels)
+    file.close()
+    text = f"asset inputs:texture:file = @{path}@\n"
+    picture = one("RectLight", text).shaping.picture
+    assert picture is not None
+    assert picture[0, 0, 0] == 1.0
+    turned = one("RectLight", text + 'double3 xformOp:scale = (-1, 1, 1)\n'
+                 'uniform token[] xformOpOrder = ["xformOp:scale"]')  # fmt: skip
+    assert turned.shaping.picture is not None
+    assert turned.shaping.picture[0, 1, 0] == 1.0
+    assert turned.world_from_light[:3, 0] == pytest.approx([1, 0, 0])
+
+
+# --- Colour temperature ---------------------------------------------------------------------------------------------
+
+
+def planckian(kelvin: float) -> NDArray[np.float64]:
+    """Linear BT.709 of a black body at luminance 1: Planck's law under the CIE 1931 curves as Wyman, Sloan and Shirley
+    fit them (JCGT 2(2), 2013)."""
+    nm = np.arange(380.0, 781.0, 1.0)
+
+    def bump(middle: float, below: float, above: float) -> NDArray[np.float64]:
+        return np.asarray(np.exp(-0.5 * ((nm - middle) * np.where(nm < middle, below, above)) ** 2))
+
+    x = 0.362 * bump(442.0, 0.0624, 0.0374) + 1.056 * bump(599.8, 0.0264, 0.0323) - 0.065 * bump(501.1, 0.0490, 0.0382)
+    y = 0.821 * bump(568.8, 0.0213, 0.0247) + 0.286 * bump(530.9, 0.0613, 0.0322)
+    z = 1.217 * bump(437.0, 0.0845, 0.0278) + 0.681 * bump(459.0, 0.0385, 0.0725)
+    light = (nm * 1e-9) ** -5 / np.expm1(1.4387769e-2 / (nm * 1e-9 * kelvin))
+    xyz = np.array([(light * curve).sum() for curve in (x, y, z)])
+    to_rgb = np.array([[3.2404542, -1.5371385, -0.4985314], [-0.969266, 1.8760108, 0.041556],
+                       [0.0556434, -0.2040259, 1.0572252]])  # fmt: skip
+    return np.asarray(to_rgb @ (xyz / xyz[1]))
+
+
+@pytest.mark.parametrize("kelvin", [2000.0, 3200.0, 4500.0, 6500.0, 9000.0])
+def test_colour_temperature_is_a_black_bodys(kelvin: float) -> None:
+    """Colour of Planck's law at luminance 1 (UsdLux: normalized), within 3 % of its brightest channel."""
+    light = one("RectLight", f"bool inputs:enableColorTemperature = 1\nfloat inputs:colorTemperature = {kelvin}")
+    expected = np.maximum(planckian(kelvin), 0.0)
+    assert np.array(light.radiance) == pytest.approx(expected, abs=0.03 * expected.max())
+    assert np.dot(light.radiance, (0.2126, 0.7152, 0.0722)) == pytest.approx(1.0, abs=2e-3)
+
+
+# --- Other forms of a dome's map ------------------------------------------------------------------------------------
+
+
+def painted(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A smooth sky without symmetry, by direction in the dome's frame."""
+    x, y, z = (direction[..., k] for k in range(3))
+    return np.stack([1 + x + 0.5 * y * z, 1.2 + y - 0.3 * x, 1.4 + z + 0.2 * x * y], -1)
+
+
+def ball_photograph(n: int) -> NDArray[np.float32]:
+    """A mirrored ball seen along -Z by an eye at +Z whose right is +X: what each of its normals reflects."""
+    v, u = np.mgrid[0:n, 0:n]
+    x, y = (u + 0.5) / n * 2 - 1, 1 - (v + 0.5) / n * 2
+    z = np.sqrt(np.maximum(0.0, 1 - x * x - y * y))
+    normal = np.stack([x, y, z], -1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    return np.asarray(painted(2 * normal[..., 2:] * normal - np.array([0, 0, 1.0])), np.float32)
+
+
+def light_probe(n: int) -> NDArray[np.float32]:
+    """The radius is the angle from +Z; +X is at the left, as in a latlong map."""
+    v, u = np.mgrid[0:n, 0:n]
+    a, b = (u + 0.5) / n * 2 - 1, 1 - (v + 0.5) / n * 2
+    radius = np.hypot(a, b)
+    off = np.minimum(radius, 1.0) * np.pi
+    side = np.sin(off) / np.maximum(radius, 1e-9)
+    return np.asarray(painted(np.stack([-a * side, b * side, np.cos(off)], -1)), np.float32)
+
+
+def vertical_cross(n: int) -> NDArray[np.float32]:
+    """Folded up it is a box seen from within: +Z in the middle, +Y above, +X at its left, -Z last, hung from -Y."""
+    out = np.zeros((4 * n, 3 * n, 3), np.float32)
+    t, s = np.mgrid[0:n, 0:n]
+    s, t = (s + 0.5) / n * 2 - 1, 1 - (t + 0.5) / n * 2
+    one = np.ones_like(s)
+    faces = {(0, 1): (-s, one, -t), (1, 0): (one, t, s), (1, 1): (-s, t, one), (1, 2): (-one, t, -s),
+             (2, 1): (-s, -one, t), (3, 1): (-s, -t, -one)}  # fmt: skip
+    for (row, column), axes in faces.items():
+        d = np.stack(axes, -1)
+        d = d / np.linalg.norm(d, axis=-1, keepdims=True)
+        out[row * n : (row + 1) * n, column * n : (column + 1) * n] = painted(d)
+    return out
+
+
+@pytest.mark.parametrize("said", ["authored", "automatic"])
+@pytest.mark.parametrize(
+    ("form", "pixels", "guessed"),
+    [("mirroredBall", ball_photograph(256), False), ("angular", light_probe(256), True),
+     ("cubeMapVerticalCross", vertical_cross(64), True)],
+    ids=["ball", "angular", "cross"],
+)  # fmt: skip
+def test_every_form_of_a_map_shows_the_same_sky(
+    tmp_path: Path, said: str, form: str, pixels: NDArray[np.float32], guessed: bool
+) -> None:
+    """Each drawn here by its own geometry, and found again in every direction; what sides do not tell must be said."""
+    if said == "automatic" and not guessed:
+        return
+    path = tmp_path / "sky.exr"
+    file = oiio.ImageOutput.create(str(path))
+    assert file is not None
+    assert file.open(str(path), oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, oiio.FLOAT))
+    assert file.write_image(pixels)
+    file.close()
+    token = form if said == "authored" else "automatic"
+    text = f'asset inputs:texture:file = @{path}@\ntoken inputs:texture:format = "{token}"'
+    _, environment, notices = read(f'def DomeLight "D"\n{{\n{text}\n}}')
+    assert [form in notice.text for notice in notices] == ([True] if said == "automatic" else [])
+    height = 128
+    found = lookup(environment.pixels, directions(slice(0, height), height, 2 * height))  # type: ignore[union-attr]
+    expected = painted(directions(slice(0, height), height, 2 * height))
+    behind = directions(slice(0, height), height, 2 * height)[..., 2] < -0.97  # there a ball shows next to nothing
+    assert np.abs(found - expected)[~behind].max() < 0.04
+    assert np.abs(found - expected)[~behind].mean() < 0.005
+
+
+def test_a_form_that_nobody_knows_is_named(tmp_path: Path) -> None:
+    path = compass(tmp_path / "sky.exr")
+    text = f'asset inputs:texture:file = @{path}@\ntoken inputs:texture:format = "fisheye"'
+    _, environment, notices = read(f'def DomeLight "D"\n{{\n{text}\n}}')
+    assert "fisheye" in notices[0].text
+    assert environment is not None
+
+
+# --- Meshes that are lights -----------------------------------------------------------------------------------------
+
+SQUARE = """
+    int[] faceVertexCounts = [4]
+    int[] faceVertexIndices = [0, 1, 2, 3]
+    point3f[] points = [(0, 0, 0), (2, 0, 0), (2, 0, 3), (0, 0, 3)]
+    uniform token subdivisionScheme = "none"
+"""
+
+
+def emitted(text: str) -> tuple[dict[str, tuple[float, ...]], list[str]]:
+    """Emission of every mesh by its path, and the paths of notices."""
+    stage = Usd.Stage.CreateInMemory()
+    stage.GetRootLayer().ImportFromString(f'#usda 1.0\n(\n    metersPerUnit = 0.5\n    upAxis = "Y"\n)\n{text}\n')
+    what = scene_from_stage(stage)
+    found = {m.path: what.materials[m.materials[0]].inputs[Param.EMISSIVE].value[:3] for m in what.meshes}
+    return found, [notice.path for notice in what.notices]
+
+
+def test_a_mesh_light_glows_by_its_inputs() -> None:
+    api = '(prepend apiSchemas = ["MeshLightAPI"])'
+    bright = "float inputs:intensity = 3\nfloat inputs:exposure = 1\ncolor3f inputs:color = (1, 0.5, 0)"
+    found, said = emitted(f'def Mesh "L" {api} {{ {SQUARE}\n{bright}\n}}\ndef Mesh "Other" {{ {SQUARE} }}')
+    assert found == {"/L": pytest.approx((6, 3, 0)), "/Other": (0, 0, 0)}
+    assert "/L" in said
+    found, _ = emitted(f'def Mesh "L" {api} {{ {SQUARE}\n{bright}\nbool inputs:normalize = 1\n}}')
+    assert found["/L"] == pytest.approx((1, 0.5, 0))  # an area of 6 in the stage's units
+
+
+def test_a_geometry_light_makes_its_mesh_glow() -> None:
+    light = 'def GeometryLight "G" { float inputs:intensity = 4\nrel geometry = </M>\n}'
+    found, said = emitted(f'def Mesh "M" {{ {SQUARE} }}\n{light}')
+    assert found["/M"] == (4.0, 4.0, 4.0)
+    assert "/G" in said
+
+
+def test_a_bound_material_glows_by_itself_unless_the_light_says_otherwise() -> None:
+    material = """
+    def Material "Mat"
+    {
+        token outputs:surface.connect = </Mat/S.outputs:surface>
+        def Shader "S"
+        {
+            uniform token info:id = "UsdPreviewSurface"
+            color3f inputs:emissiveColor = (0.25, 0, 0)
+            token outputs:surface
+        }
+    }
+    """
+    api = '(prepend apiSchemas = ["MeshLightAPI", "MaterialBindingAPI"])'
+    mesh = f'def Mesh "L" {api} {{ {SQUARE}\nrel material:binding = </Mat>\n'
+    assert emitted(material + mesh + "}")[0]["/L"] == (0.25, 0.0, 0.0)
+    alone = 'uniform token light:materialSyncMode = "noMaterialResponse"\n}'
+    assert emitted(material + mesh + alone)[0]["/L"] == (1.0, 1.0, 1.0)

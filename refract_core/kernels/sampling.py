@@ -35,6 +35,8 @@ class Purpose(IntEnum):
     """which of the sky's candidates"""
     SKY_RADIANCE = 6
     """a candidate of the sky, by its radiance"""
+    SHADOW_LENGTH = 7
+    """how far a light's shadow reaches"""
     LIGHT = 16
     """a point of light 0; those of the other lights follow"""
 

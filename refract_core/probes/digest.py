@@ -204,6 +204,12 @@ def _light(light: Light) -> bytes:
     total = hashlib.sha256()
     _feed(total, "light", int(light.kind), light.radiance, light.world_from_light, light.size)
     _feed(total, light.diffuse, light.specular)
+    shaping, shadow = light.shaping, light.shadow
+    _feed(total, shaping.focus, shaping.focus_tint, shaping.cone, shaping.softness)
+    _feed(total, *(value for value in (shaping.profile, shaping.picture) if value is not None))
+    _feed(total, int(light.casts_shadow), shadow.color, shadow.distance, shadow.falloff, shadow.gamma)
+    for paths in (light.lit, light.casters):
+        _feed(total, "linked" if paths is not None else "", *sorted(paths or ()))
     return total.digest()
 
 

@@ -15,11 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..scene import Camera, Material, Notice, Param, Probe, Scene, Volume
-from ..world.embree import FIRST_CAPTURED_BIT, OPAQUE, OPAQUE_STATIC
-from ..world.tables import prim_of
+from ..world.embree import CASTER_SHIFTS, FIRST_CAPTURED_BIT, OPAQUE, OPAQUE_STATIC
+from ..world.tables import caster_sets, prim_of
 from .lookup import bounds_of, camera_weight
-
-_MAX_SETS = 31 - FIRST_CAPTURED_BIT
 
 Box = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -142,8 +140,9 @@ def _mask_of(scene: Scene, probe: Probe, sets: list[frozenset[str] | None], noti
         return everything
     seen = seen_things(scene, probe)
     if seen not in sets:
-        if len(sets) >= _MAX_SETS:
-            text = f"more than {_MAX_SETS} different collections 'captured' in one stage; this probe sees everything"
+        most = min([31, *CASTER_SHIFTS[: len(caster_sets(scene))]]) - FIRST_CAPTURED_BIT
+        if len(sets) >= most:
+            text = f"more than {most} different collections 'captured' in one stage; this probe sees everything"
             notices.append(Notice(probe.path, f"{text}. Let several probes share one collection, or bake them apart"))
             return everything
         sets.append(seen)

@@ -20,8 +20,8 @@ from ..scene import Camera, Cubemap, Notice, Param, Probe, Scene
 from ..settings import RenderSettings
 from ..world import environment, textures
 from ..world.embree import Bvh
-from ..world.lights import pack_lights
-from ..world.tables import World, pack_geometry, pack_materials, primvar_slots, world_of
+from ..world.lamps import pack_lights
+from ..world.tables import World, caster_sets, pack_geometry, pack_materials, primvar_slots, world_of
 from .caustics import caustics_of, plan_caustics, with_caustics
 from .session import Session
 from .work import Cancel, Progress, Work, working
@@ -209,7 +209,8 @@ def _joined(entries: Sequence[Entry], captures: Sequence[_Capture], camera: Came
 def _geometry_source(scene: Scene, chosen: Plan) -> Any:
     """All that `pack_geometry` reads."""
     kinds = tuple((material.refractive, material.cutout) for material in scene.materials)
-    return scene.meshes, scene.spheres, kinds, primvar_slots(scene.materials), tuple(chosen.captured_sets)
+    slots = primvar_slots(scene.materials)
+    return scene.meshes, scene.spheres, kinds, slots, tuple(chosen.captured_sets), tuple(caster_sets(scene))
 
 
 def _paste(table: ProbeTable, k: int, alone: ProbeTable) -> None:

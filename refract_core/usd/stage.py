@@ -22,6 +22,7 @@ from .geometry.place import Placed, bounds_of, place, to_mesh, to_sphere
 from .geometry.shapes import INWARDS, TURN, Shape, read_shape
 from .geometry.skel import posed
 from .geometry.traverse import Placement, refuse_too_many, some_of, walk
+from .lights.meshes import glowing
 from .lights.read import read_lights
 from .ours import recognised
 from .probes.pictures import read_cubemap
@@ -166,6 +167,7 @@ def _read(
         extent = -np.ones(3), np.ones(3)
     centre = _origin(*extent)
     meshes, spheres = _drawn(placed, centre)
+    meshes = glowing(stage, time, meshes, tables.materials, metres_per_unit=metres_per_unit, notices=notices)
     engine_from_stage = metres_from_stage.copy()
     engine_from_stage[:3, 3] = -centre
     bounds = triple(extent[0] - centre), triple(extent[1] - centre)
@@ -175,7 +177,9 @@ def _read(
         "notices": notices,
     }
     cameras = choose_camera(stage, time, read_cameras(stage, time, **frame), camera, bounds, notices)
-    lights, environment = read_lights(stage, time, purposes=purposes, **frame)
+    things = [mesh.path for mesh in meshes] + [ball.path for ball in spheres]
+    paths = tuple(dict.fromkeys(path.partition("/[")[0] for path in things))
+    lights, environment = read_lights(stage, time, purposes=purposes, drawn=paths, **frame)
     every = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
     glow, dull = _glow(tables, meshes, spheres)
     if glow and dull and not lights and environment is None:

@@ -41,7 +41,7 @@ from ..world.shading import (
 )
 from ..world.surface import hit_in
 from ..world.tables import World
-from ..world.tracing import intersect_world, visible
+from ..world.tracing import intersect_world, lamp_visible, visible
 from .camera import Tile, View
 from .gbuffer import OpaqueLayer, ViewScratch, add_view_ray, is_refractive, keep_hits, trace_behind_glass, write_opaque
 
@@ -258,7 +258,7 @@ def _find(scratch: QuietScratch, world: World, l: int, x0: int, y0: int, x1: int
                         add_light_ray(places, i, lights, l, packet, lane, _net_key(x, y))
             if not some:
                 continue
-            visible(packet, world, OPAQUE, scratch.free)
+            lamp_visible(packet, world, OPAQUE, l, scratch.free)
             for lane in range(LANES):
                 x, y = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
                 if packet.valid[lane] != 0:
@@ -286,7 +286,7 @@ def _share_of_lamp(scratch: QuietScratch, world: World, rays: int, l: int, i: in
         clear(packet)
         for lane in range(min(LANES, rays - first)):
             add_light_ray(scratch.places, i, world.lights, l, packet, lane, nth(_net_key(x, y), first + lane, rays))
-        visible(packet, world, OPAQUE, scratch.free)
+        lamp_visible(packet, world, OPAQUE, l, scratch.free)
         for lane in range(min(LANES, rays - first)):
             total = add(total, row(scratch.free, lane))
     return scale(total, 1.0 / rays)

@@ -30,6 +30,9 @@ CUTOUT_STATIC = word(4)
 CUTOUT_MOVING = word(8)
 REFRACTIVE = word(16)
 FIRST_CAPTURED_BIT = 5
+CASTER_SHIFTS = (27, 23, 19, 15)
+"""What casts the shadows of lights that not everything casts carries the first four bits again, so much higher: one
+place for each set of casters, taken from the top. No more captured sets than fit below."""
 SOLID = SOLID_STATIC | SOLID_MOVING
 CUTOUT = CUTOUT_STATIC | CUTOUT_MOVING
 OPAQUE = SOLID | CUTOUT

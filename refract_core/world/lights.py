@@ -5,8 +5,9 @@ an unshadowed surface has no noise at all and only penumbras need samples. The h
 shape nearest to the mirror direction (Karis, "Real Shading in Unreal Engine 4", 2013, area lights), and from the shape
 itself where the surface is a mirror.
 
-Every kind of light is one row of `KINDS`: three functions of a `Lamp`. Directions are unit vectors unless they are said
-to be more, lengths metres, all in engine world. Nothing here raises.
+Every kind of light is one row of `KINDS`: three functions of a `Lamp`. What a light leaves out by direction or place
+(UsdLux ShapingAPI, a picture on a rectangle) is `world.shaping`; here it is even. Directions are unit vectors unless
+they are said to be more, lengths metres, all in engine world. Nothing here raises.
 """
 
 from __future__ import annotations
@@ -15,18 +16,17 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from ..kernels.arrays import F64_1D, F64_2D, F64_3D, I32_1D, U8_1D
+from ..kernels.arrays import F32_1D, F64_1D, F64_2D, F64_3D, I32_1D, I64_2D, U8_1D, U8_2D
 from ..kernels.choice import choice
 from ..kernels.compile import inlined, leaf
 from ..kernels.vec import Vec, add, cross, dot, frame, length, lerp, normalize, row, scale, sub
 from ..optics.lobes import ggx, smith_visibility
-from ..scene import Light, LightKind, Scene
+from ..scene import LightKind
 
 _DISK_SIDES = 12
 """A disk's irradiance is that of the regular polygon with as many sides and the disk's area."""
+_ARC_SIDES = 8
+"""Straight pieces that the seen half of a cylinder's end is made of."""
 _SMALLEST_POINT_LOBE = 0.02
 """GGX width [alpha] below which a light without size is not sharpened: it would be an infinitely bright dot."""
 _NEAREST2 = 1e-12
@@ -34,6 +34,23 @@ _NEAREST2 = 1e-12
 
 
 # --- the table ------------------------------------------------------------------------------------------------------
+
+
+class ShapeTable(NamedTuple):
+    """One row per light: what it leaves out of its radiance (`scene.Shaping`)."""
+
+    focus: F64_1D
+    """shape (L,): power"""
+    tint: F64_2D
+    """shape (L, 3): what focus leaves where it leaves least"""
+    cone: F64_2D
+    """shape (L, 2): angles to its axis where it begins to fade, and where it is dark [rad]; pi without a cone"""
+    profile: I64_2D
+    """shape (L, 3): first value in the pool, rows, columns; no rows without one"""
+    picture: I64_2D
+    """shape (L, 2): first texel in the pool, in threes, and the finest level; -1 without one"""
+    pool: F32_1D
+    """profiles, and pictures from their mean on: level j has 2^j by 2^j texels"""
 
 
 class LightTable(NamedTuple):
@@ -44,7 +61,8 @@ class LightTable(NamedTuple):
     axes: F64_3D
     """shape (L, 4, 3): unit x, unit y, unit direction it faces (its -Z), position [m]"""
     size: F64_2D
-    """shape (L, 2): Rect half width, half height [m]; Disk, Sphere radius [m]; Distant half angle [rad]"""
+    """shape (L, 2): Rect half width, half height [m]; Disk, Sphere radius [m]; Distant half angle [rad];
+    Cylinder radius, half length [m]"""
     radiance: F64_2D
     """shape (L, 3); the limit quantity where size is 0 (see `scene.Light`)"""
     diffuse: F64_1D
@@ -53,6 +71,21 @@ class LightTable(NamedTuple):
     """shape (L,): factor of its highlights"""
     casts_shadow: U8_1D
     """shape (L,)"""
+    even: U8_1D
+    """shape (L,): 1 where its radiance is the same all over it and in all directions"""
+    shapes: ShapeTable
+    """where it is not"""
+    hidden: F64_2D
+    """shape (L, 3): share of it that arrives where something stands before it"""
+    reach: F64_2D
+    """shape (L, 3): how near what stands before it must be [m], over which part of that shadows fade [m], and by which
+    power"""
+    caster_shift: I32_1D
+    """shape (L,): bits from the masks of what casts shadows to the masks of what casts its shadows (`embree`)"""
+    link: I32_1D
+    """shape (L,): row of `linked`; -1 where it lights everything"""
+    linked: U8_2D
+    """shape (R, things): 1 where it lights a thing"""
 
 
 class Lamp(NamedTuple):
@@ -70,36 +103,8 @@ class Lamp(NamedTuple):
     """second of `LightTable.size`"""
 
 
-def pack_lights(scene: Scene, eye: NDArray[np.float64]) -> LightTable:
-    """Lights of a scene that shine; with none at all, one at the eye that lights a white surface facing it to 1.
-
-    A light of radiance 0 is left out: it would cost its shadow rays and bring nothing.
-    """
-    lights = [light for light in scene.lights if any(light.radiance)]
-    lights += [_camera_light(eye)] if scene.camera_light else []
-    places = [light.world_from_light for light in lights]
-    factors = [KINDS[light.kind].size_factor for light in lights]
-    n = len(lights)
-    return LightTable(
-        kind=np.array([light.kind for light in lights], np.int32),
-        axes=np.array([[m[:3, 0], m[:3, 1], -m[:3, 2], m[:3, 3]] for m in places], np.float64).reshape(n, 4, 3),
-        size=np.array([[s * f for s in light.size] for light, f in zip(lights, factors, strict=True)]).reshape(n, 2),
-        radiance=np.array([light.radiance for light in lights], np.float64).reshape(n, 3),
-        diffuse=np.array([light.diffuse for light in lights], np.float64),
-        specular=np.array([light.specular for light in lights], np.float64),
-        casts_shadow=np.array([light.kind.casts_shadow for light in lights], np.uint8),
-    )
-
-
-def _camera_light(eye: NDArray[np.float64]) -> Light:
-    """E = pi on what faces it, so that Lambert's albedo E / pi is the albedo."""
-    place = np.eye(4)
-    place[:3, 3] = eye
-    return Light("", LightKind.CAMERA, (math.pi, math.pi, math.pi), place)
-
-
 @leaf
-def _lamp(lights: LightTable, which: int) -> Lamp:
+def lamp_of(lights: LightTable, which: int) -> Lamp:
     axes = lights.axes[which]
     x, y, face, centre = row(axes, 0), row(axes, 1), row(axes, 2), row(axes, 3)
     return Lamp(x, y, face, centre, lights.size[which, 0], lights.size[which, 1])
@@ -115,14 +120,14 @@ def shadow_ray(lights: LightTable, which: int, p: Vec, u1: float, u2: float) -> 
     Points are spread evenly over the light's area as `p` sees it (of a sphere: over the disk it shows), which is what
     the share of it that is hidden has to be measured by. `u1`, `u2`: 0 .. 1.
     """
-    return _target(lights.kind[which], _lamp(lights, which), p, u1, u2)
+    return target_on(lights.kind[which], lamp_of(lights, which), p, u1, u2)
 
 
 @inlined
 def irradiance_factor(lights: LightTable, which: int, p: Vec, n: Vec) -> float:
     """Unoccluded irradiance at `p` on a surface with normal `n`, per radiance of a light [sr]: the integral of the
     cosine over the directions that the light fills, horizon included. Without size, the limit's own unit."""
-    return _irradiance(lights.kind[which], _lamp(lights, which), p, n)
+    return _irradiance(lights.kind[which], lamp_of(lights, which), p, n)
 
 
 @inlined
@@ -137,7 +142,7 @@ def highlight(lights: LightTable, which: int, p: Vec, n: Vec, wo: Vec, alpha: fl
     if n_dot_v <= 0.0:
         return 0.0
     r = sub(scale(n, 2.0 * n_dot_v), wo)
-    point, inside, solid, radius = _nearest(lights.kind[which], _lamp(lights, which), p, r)
+    point, inside, solid, radius = nearest_to(lights.kind[which], lamp_of(lights, which), p, r)
     if solid <= 0.0:
         return 0.0
     # Sharp surfaces show the light's own shape, rough ones its blur; in between both, so that there is no step.
@@ -206,6 +211,26 @@ def _disk_target(lamp: Lamp, p: Vec, u1: float, u2: float) -> tuple[Vec, float]:
     if lamp.a > 0.0:
         target = _on_disk(lamp.centre, lamp.x, lamp.y, lamp.a, u1, u2)
     return _towards(p, target)
+
+
+@inlined
+def across(lamp: Lamp, p: Vec) -> tuple[float, float, Vec]:
+    """How far the middle of a cylinder is from `p` along its axis [m], how far the axis is across [m], and the unit
+    vector that way."""
+    to = sub(lamp.centre, p)
+    ahead = dot(to, lamp.x)
+    off = sub(to, scale(lamp.x, ahead))
+    rho = max(length(off), 1e-9)
+    return ahead, rho, scale(off, 1.0 / rho)
+
+
+@inlined
+def _cylinder_target(lamp: Lamp, p: Vec, u1: float, u2: float) -> tuple[Vec, float]:
+    """On the rectangle through its axis that it shows to `p`."""
+    _, _, w = across(lamp, p)
+    side = cross(lamp.x, w)
+    off = add(scale(lamp.x, (2.0 * u1 - 1.0) * lamp.b), scale(side, (2.0 * u2 - 1.0) * lamp.a))
+    return _towards(p, add(lamp.centre, off))
 
 
 @inlined
@@ -346,6 +371,74 @@ def _polygon_irradiance(p: Vec, n: Vec, centre: Vec, x: Vec, y: Vec, sides: int)
 
 
 @inlined
+def _cylinder_irradiance(lamp: Lamp, p: Vec, n: Vec) -> float:
+    """Of the half of it that faces `p`, by Lambert's formula around its outline: both lines where it bends away, and
+    between them the near halves of both ends. Its ends are dark, and so is its inside."""
+    ahead, rho, w = across(lamp, p)
+    if lamp.a <= 0.0:
+        return _line_irradiance(ahead, rho, lamp.b, dot(lamp.x, n), dot(w, n))
+    if rho <= lamp.a:
+        return 0.0
+    side = cross(lamp.x, w)
+    widest = math.acos(lamp.a / rho)
+    total = 0.0
+    first = leaving = (0.0, 0.0, 0.0)
+    entered = left = False
+    a = _tube_corner(lamp, ahead, rho, w, side, widest, 0)
+    for k in range(2 * _ARC_SIDES + 2):
+        b = _tube_corner(lamp, ahead, rho, w, side, widest, (k + 1) % (2 * _ARC_SIDES + 2))
+        ha, hb = dot(a, n), dot(b, n)
+        start, end = a, b
+        if (ha > 0.0) != (hb > 0.0):  # unlike a flat light's, its outline may cross the horizon more than twice
+            crossing = normalize(lerp(a, b, ha / (ha - hb)))
+            if ha > 0.0:
+                end = leaving = crossing
+                left = True
+            else:
+                start = crossing
+                if left:
+                    total += _polygon_edge(leaving, crossing, n)
+                else:
+                    first, entered = crossing, True
+                left = False
+        if ha > 0.0 or hb > 0.0:
+            total += _polygon_edge(start, end, n)
+        a = b
+    if left and entered:
+        total += _polygon_edge(leaving, first, n)
+    return abs(total) * 0.5
+
+
+@inlined
+def _tube_corner(lamp: Lamp, ahead: float, rho: float, w: Vec, side: Vec, widest: float, k: int) -> Vec:
+    """Unit direction to corner `k` of a cylinder's outline: over the near half of one end, and back over the other."""
+    near = k <= _ARC_SIDES
+    i = k if near else 2 * _ARC_SIDES + 1 - k
+    phi = widest * (2.0 * i / _ARC_SIDES - 1.0)
+    place = add(scale(w, rho - lamp.a * math.cos(phi)), scale(side, lamp.a * math.sin(phi)))
+    return normalize(add(place, scale(lamp.x, ahead + (lamp.b if near else -lamp.b))))
+
+
+@inlined
+def _line_irradiance(ahead: float, rho: float, half: float, along: float, facing: float) -> float:
+    """Of a line, per radiance times width: the integral of rho (rho facing + t along) / (rho^2 + t^2)^2 over what of it
+    is above the horizon. `along`, `facing`: the normal's cosines to the line, and to the way to it."""
+    low, high = ahead - half, ahead + half
+    if along > 0.0:
+        low = max(low, -rho * facing / along)
+    elif along < 0.0:
+        high = min(high, -rho * facing / along)
+    elif facing <= 0.0:
+        return 0.0
+    if low >= high:
+        return 0.0
+    fallen = 0.5 / (rho * rho + low * low) - 0.5 / (rho * rho + high * high)
+    turned = 0.5 * (high / (rho * rho + high * high) - low / (rho * rho + low * low))
+    turned += 0.5 * (math.atan(high / rho) - math.atan(low / rho)) / rho
+    return max(0.0, facing * turned + along * rho * fallen)
+
+
+@inlined
 def _camera_irradiance(lamp: Lamp, p: Vec, n: Vec) -> float:
     """As if it were equally near to everything: the picture of a stage without lights has no bright middle."""
     _, _, cosine = _place(lamp, p, n)
@@ -428,6 +521,31 @@ def _disk_nearest(lamp: Lamp, p: Vec, r: Vec) -> Nearest:
 
 
 @inlined
+def _cylinder_nearest(lamp: Lamp, p: Vec, r: Vec) -> Nearest:
+    """From the place on its axis nearest to the ray, towards it as far as the radius (Karis 2013, tube lights)."""
+    c = sub(lamp.centre, p)
+    ahead, rho, w = across(lamp, p)
+    if rho <= lamp.a:
+        return c, False, 0.0, 0.0
+    slope = dot(r, lamp.x)
+    bend = max(1.0 - slope * slope, 1e-9)
+    s = (dot(r, c) * slope - ahead) / bend
+    nearest = add(c, scale(lamp.x, min(lamp.b, max(-lamp.b, s))))
+    off = sub(scale(r, dot(nearest, r)), nearest)
+    point = add(nearest, scale(off, min(1.0, lamp.a / max(length(off), 1e-12))))
+    # Where the ray meets the round of it, seen along the axis a circle.
+    toward = rho * dot(w, r)
+    root = toward * toward - bend * (rho * rho - lamp.a * lamp.a)
+    inside = False
+    if root >= 0.0 and toward > 0.0:
+        t = (toward - math.sqrt(root)) / bend
+        inside = abs(t * slope - ahead) <= lamp.b
+    d2 = rho * rho + ahead * ahead
+    solid = 2.0 * lamp.b * rho / (d2 * math.sqrt(d2)) * (2.0 * lamp.a if lamp.a > 0.0 else 1.0)
+    return point, inside, solid, math.sqrt(solid / math.pi) if lamp.a > 0.0 else 0.0
+
+
+@inlined
 def _camera_nearest(lamp: Lamp, p: Vec, r: Vec) -> Nearest:
     return sub(lamp.centre, p), False, 1.0, 0.0
 
@@ -444,18 +562,19 @@ class Kind(NamedTuple):
     """as `irradiance_factor`"""
     nearest: Callable[[Lamp, Vec, Vec], Nearest]
     """(lamp, point, mirrored direction) -> as `Nearest`"""
-    size_factor: float = 1.0
+    size_factor: tuple[float, float] = (1.0, 1.0)
     """`LightTable.size` of `scene.Light.size`: rectangles and cones are measured from their middle."""
 
 
 KINDS = {
-    LightKind.DISTANT: Kind(_distant_target, _distant_irradiance, _distant_nearest, 0.5),
+    LightKind.DISTANT: Kind(_distant_target, _distant_irradiance, _distant_nearest, (0.5, 0.5)),
     LightKind.SPHERE: Kind(_sphere_target, _sphere_irradiance, _sphere_nearest),
-    LightKind.RECT: Kind(_rect_target, _rect_irradiance, _rect_nearest, 0.5),
+    LightKind.RECT: Kind(_rect_target, _rect_irradiance, _rect_nearest, (0.5, 0.5)),
     LightKind.DISK: Kind(_disk_target, _disk_irradiance, _disk_nearest),
+    LightKind.CYLINDER: Kind(_cylinder_target, _cylinder_irradiance, _cylinder_nearest, (1.0, 0.5)),
     LightKind.CAMERA: Kind(_camera_target, _camera_irradiance, _camera_nearest),
 }
 _CAMERA = KINDS[LightKind.CAMERA]
-_target = choice({kind: one.target for kind, one in KINDS.items()}, _CAMERA.target)
+target_on = choice({kind: one.target for kind, one in KINDS.items()}, _CAMERA.target)
 _irradiance = choice({kind: one.irradiance for kind, one in KINDS.items()}, _CAMERA.irradiance)
-_nearest = choice({kind: one.nearest for kind, one in KINDS.items()}, _CAMERA.nearest)
+nearest_to = choice({kind: one.nearest for kind, one in KINDS.items()}, _CAMERA.nearest)

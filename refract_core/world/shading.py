@@ -24,9 +24,10 @@ from .embree import SCATTERED, Packet, clear, has_hit, ray_direction, set_ray
 from .environment import TEXEL_LUMINANCE, EnvironmentTable, direction_pdf, irradiance, prefiltered, sample_direction
 from .lights import LightTable, highlight, irradiance_factor, shadow_ray
 from .offsets import off_surface
+from .shaping import shape_matt, shape_mirrored
 from .surface import Interaction, color_input, float_input, hit_in, interaction, normal_input, share_input
 from .tables import World
-from .tracing import add_shadow_ray, intersect_world, ray_of, visible
+from .tracing import add_shadow_ray, intersect_world, lamp_visible, ray_of, visible
 
 _REFLECTED_ROUGHNESS = 0.5
 _POLISHED_ROUGHNESS = 0.2
@@ -80,6 +81,8 @@ class Block(NamedTuple):
     """rays that a rough mirror sends; likewise"""
     distance: Scalars
     """hit distance [m]; inf where nothing was hit"""
+    thing: Words
+    """number of the prim, as `Geometry.thing`"""
 
     # The light, from `gather` or `shade` until the next of them.
     diffuse: Vectors
@@ -101,6 +104,10 @@ class Block(NamedTuple):
     """irradiance per radiance of the light, if nothing is in the way [sr]"""
     lamp_specular: Scalars
     """highlight per radiance of the light, without Fresnel, if nothing is in the way"""
+    lamp_tint: Vectors
+    """share of its radiance that shaping leaves for the first; where it is not even"""
+    lamp_gleam: Vectors
+    """and for the second"""
     lamp_asked: Flags
     """1 where it would bring anything, and casts shadows"""
     lamp_seen: Vectors
@@ -152,6 +159,7 @@ def load_surface(block: Block, lane: int, at: Interaction, world: World, wo: Vec
         f0 = lerp((dielectric, dielectric, dielectric), base, metallic)
     roughness = share_input(world, at, Param.ROUGHNESS.value)
     diffuse = mul(scale(base, 1.0 - metallic), _entering(f0, roughness, abs(dot(ns, wo))))
+    block.thing[lane] = world.geometry.thing[at.hit.part]
     put(block.point, lane, at.point)
     put(block.ng, lane, ng)
     put(block.ns, lane, ns)
@@ -199,7 +207,7 @@ def paint(at: Interaction, world: World, share: Vec) -> tuple[Vec, Vec]:
 @inlined
 def copy_lane(to: Block, i: int, block: Block, lane: int) -> None:
     """A surface, and the light that has been gathered for it, into another block."""
-    to.on[i], to.matte[i] = block.on[lane], block.matte[lane]
+    to.on[i], to.matte[i], to.thing[i] = block.on[lane], block.matte[lane], block.thing[lane]
     put(to.point, i, row(block.point, lane))
     put(to.ng, i, row(block.ng, lane))
     put(to.ns, i, row(block.ns, lane))
@@ -257,7 +265,7 @@ def _gather_lights(block: Block, packet: Packet, world: World, mask: int) -> Non
                 if block.lamp_asked[lane] != 0 and k < block.rays[lane]:
                     key = nth(key_of(block.key, lane), k, block.rays[lane])
                     add_light_ray(block, lane, lights, l, packet, lane, key)
-            visible(packet, world, mask, block.free)
+            lamp_visible(packet, world, mask, l, block.free)
             for lane in range(LANES):
                 if block.lamp_asked[lane] != 0 and k < block.rays[lane]:
                     share = along(row(block.lamp_seen, lane), row(block.free, lane), 1.0 / block.rays[lane])
@@ -276,14 +284,42 @@ def nth(key: Key, k: int, times: int) -> Key:
 @inlined
 def aim_light(block: Block, lane: int, lights: LightTable, l: int) -> bool:  # noqa: E741
     """Note what a light would bring to a hit if nothing were in the way. Whether that is anything."""
-    block.lamp_diffuse[lane] = 0.0
+    block.lamp_diffuse[lane] = block.lamp_specular[lane] = 0.0
+    if not _links(block, lane, lights, l):
+        return False
     p, n, wo = row(block.point, lane), row(block.ns, lane), row(block.wo, lane)
     if block.matte[lane] != 0:
         block.lamp_diffuse[lane] = irradiance_factor(lights, l, p, n) * lights.diffuse[l]
     gloss = block.roughness[lane]
     block.lamp_specular[lane] = highlight(lights, l, p, n, wo, gloss * gloss) * lights.specular[l]
+    if lights.even[l] == 0:
+        _shape(block, lane, lights, l)
     # A clear coat has a highlight of its own, where the rest of the surface may have none.
     return block.lamp_diffuse[lane] + block.lamp_specular[lane] > 0.0 or block.coat[lane] > 0.0
+
+
+@inlined
+def _links(block: Block, lane: int, lights: LightTable, l: int) -> bool:  # noqa: E741
+    """The light lights the prim that was hit."""
+    link = lights.link[l]
+    return link < 0 or lights.linked[link, block.thing[lane]] != 0
+
+
+@inlined
+def _shape(block: Block, lane: int, lights: LightTable, l: int) -> None:  # noqa: E741
+    """Note what an uneven light leaves out of its radiance; where that is all, it brings nothing."""
+    p, n, wo = row(block.point, lane), row(block.ns, lane), row(block.wo, lane)
+    if block.lamp_diffuse[lane] > 0.0:
+        tint = shape_matt(lights, l, p, n)
+        put(block.lamp_tint, lane, tint)
+        if max(tint[0], tint[1], tint[2]) <= 0.0:
+            block.lamp_diffuse[lane] = 0.0
+    if block.lamp_specular[lane] > 0.0:
+        gloss = block.roughness[lane]
+        tint = shape_mirrored(lights, l, p, n, wo, gloss * gloss)
+        put(block.lamp_gleam, lane, tint)
+        if max(tint[0], tint[1], tint[2]) <= 0.0:
+            block.lamp_specular[lane] = 0.0
 
 
 @inlined
@@ -294,16 +330,30 @@ def add_light_ray(
     u1, u2 = unit_pair(key, Purpose.LIGHT.value + l)
     p = row(block.point, i)
     direction, distance = shadow_ray(lights, l, p, u1, u2)
+    if lights.reach[l, 0] < math.inf:
+        distance = min(distance, _shadow_length(lights, l, key))
     add_shadow_ray(packet, lane, p, row(block.ng, i), direction, distance)
+
+
+@inlined
+def _shadow_length(lights: LightTable, l: int, key: Key) -> float:  # noqa: E741
+    """How near what casts a shadow must be to this ray [m]: a length drawn so that as many are longer than a distance
+    as there is shadow left at it, ((reach - distance) / falloff) ^ gamma (UsdLux ShadowAPI)."""
+    u, _ = unit_pair(key, Purpose.SHADOW_LENGTH.value)
+    return lights.reach[l, 0] - lights.reach[l, 1] * u ** lights.reach[l, 2]
 
 
 @inlined
 def add_light(block: Block, lane: int, lights: LightTable, l: int) -> None:  # noqa: E741
     """Add one light, whose share of the hit is known, to its sums."""
-    seen = row(block.lamp_seen, lane)
-    if seen[0] == 0.0 and seen[1] == 0.0 and seen[2] == 0.0:
+    seen, hidden = row(block.lamp_seen, lane), row(lights.hidden, l)
+    arrives = (
+        hidden[0] + (1.0 - hidden[0]) * seen[0], hidden[1] + (1.0 - hidden[1]) * seen[1],
+        hidden[2] + (1.0 - hidden[2]) * seen[2],
+    )  # fmt: skip
+    if max(arrives[0], arrives[1], arrives[2]) <= 0.0 or not _links(block, lane, lights, l):
         return
-    radiance = mul(row(lights.radiance, l), seen)
+    matt = gleam = over = mul(row(lights.radiance, l), arrives)
     n, wo, p = row(block.ns, lane), row(block.wo, lane), row(block.point, lane)
     f = row(block.fresnel, lane)
     coat = block.coat[lane]
@@ -312,9 +362,13 @@ def add_light(block: Block, lane: int, lights: LightTable, l: int) -> None:  # n
         gloss = block.coat_roughness[lane]
         fc = coat * (_COAT_F0 + (1.0 - _COAT_F0) * (1.0 - min(1.0, max(0.0, dot(n, wo)))) ** 5)
         coat_light = fc * highlight(lights, l, p, n, wo, gloss * gloss) * lights.specular[l]
+        if lights.even[l] == 0 and coat_light > 0.0:
+            over = mul(over, shape_mirrored(lights, l, p, n, wo, gloss * gloss))
+    if lights.even[l] == 0:
+        matt, gleam = mul(matt, row(block.lamp_tint, lane)), mul(gleam, row(block.lamp_gleam, lane))
     for c in range(3):
-        block.diffuse[lane, c] += radiance[c] * block.lamp_diffuse[lane]
-        block.specular[lane, c] += radiance[c] * (block.lamp_specular[lane] * f[c] + coat_light)
+        block.diffuse[lane, c] += matt[c] * block.lamp_diffuse[lane]
+        block.specular[lane, c] += gleam[c] * block.lamp_specular[lane] * f[c] + over[c] * coat_light
 
 
 @inlined

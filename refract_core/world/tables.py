@@ -13,7 +13,17 @@ from ..kernels.arrays import F32_1D, F32_2D, F32_3D, I32_1D, I32_2D, I32_3D, I64
 from ..scene import Material, Mesh, Model, Param, Scene, Source, Sphere
 from . import embree
 from .caustics import Caustics, no_caustics
-from .embree import CUTOUT_MOVING, CUTOUT_STATIC, FIRST_CAPTURED_BIT, REFRACTIVE, SOLID_MOVING, SOLID_STATIC, Bvh, Part
+from .embree import (
+    CASTER_SHIFTS,
+    CUTOUT_MOVING,
+    CUTOUT_STATIC,
+    FIRST_CAPTURED_BIT,
+    REFRACTIVE,
+    SOLID_MOVING,
+    SOLID_STATIC,
+    Bvh,
+    Part,
+)
 from .environment import EnvironmentTable
 from .lights import LightTable
 from .textures import TextureTable
@@ -301,7 +311,16 @@ def prim_of(path: str) -> str:
     return path.partition("/[")[0]
 
 
-def _mask(material: Material, static: bool, path: str, captured_sets: Sequence[frozenset[str] | None]) -> int:
+def caster_sets(scene: Scene) -> list[frozenset[str]]:
+    """Paths of the prims that cast the shadows of some light, for lights whose shadows not everything casts; at most as
+    many as there are `CASTER_SHIFTS`, which readers see to."""
+    return list(dict.fromkeys(frozenset(light.casters) for light in scene.lights if light.casters is not None))
+
+
+def _mask(
+    material: Material, static: bool, path: str, captured_sets: Sequence[frozenset[str] | None],
+    casters: Sequence[frozenset[str]],
+) -> int:  # fmt: skip
     if material.refractive:
         return int(REFRACTIVE)
     still, moving = (CUTOUT_STATIC, CUTOUT_MOVING) if material.cutout else (SOLID_STATIC, SOLID_MOVING)
@@ -309,12 +328,16 @@ def _mask(material: Material, static: bool, path: str, captured_sets: Sequence[f
     for k, paths in enumerate(captured_sets):
         if paths is None or prim_of(path) in paths:
             mask |= 1 << (FIRST_CAPTURED_BIT + k)
+    for shift, paths in zip(CASTER_SHIFTS, casters, strict=False):
+        if prim_of(path) in paths:
+            mask |= int(still if static else moving) << shift
     return mask
 
 
 def _add_mesh(pile: _Pile, scene: Scene, mesh: Mesh, thing: int, captured_sets: Sequence[Any]) -> None:
     used, which = np.unique(mesh.materials, return_inverse=True)
-    masks = [_mask(scene.materials[m], mesh.static, mesh.path, captured_sets) for m in used]
+    casters = caster_sets(scene)
+    masks = [_mask(scene.materials[m], mesh.static, mesh.path, captured_sets, casters) for m in used]
     mask_of_triangle = np.array(masks, np.int64)[which]
     bounds = (mesh.points.min(axis=0), mesh.points.max(axis=0)) if len(mesh.points) else (np.zeros(3), np.zeros(3))
     base = pile.point_count
@@ -335,9 +358,8 @@ def _add_mesh(pile: _Pile, scene: Scene, mesh: Mesh, thing: int, captured_sets: 
 
 
 def _add_sphere(pile: _Pile, scene: Scene, ball: Sphere, thing: int, captured_sets: Sequence[Any]) -> None:
-    part = Part(
-        _mask(scene.materials[ball.material], ball.static, ball.path, captured_sets), None, (*ball.centre, ball.radius)
-    )
+    mask = _mask(scene.materials[ball.material], ball.static, ball.path, captured_sets, caster_sets(scene))
+    part = Part(mask, None, (*ball.centre, ball.radius))
     centre = np.array(ball.centre)
     bounds = (centre - ball.radius, centre + ball.radius)
     pile.add(part, np.array([ball.material], np.int32), thing, False, None, ball.primvars, bounds)

@@ -25,6 +25,7 @@ from .embree import (
     DIR_Y,
     DIR_Z,
     MASK,
+    OPAQUE,
     ORG_X,
     REFRACTIVE,
     SCATTERED,
@@ -128,12 +129,26 @@ def visible(packet: Packet, world: World, mask: int, seen: Vectors) -> None:
     All that may be in the way is asked at once. Only where something is do cut-outs have to be looked at, and glass
     looked through: straight on, for light on its way to an opaque surface is bent by photons alone (`world.caustics`).
     """
+    _visible(packet, world, mask & ~CUTOUT, mask & CUTOUT, seen)
+
+
+@inlined
+def lamp_visible(packet: Packet, world: World, mask: int, which: int, seen: Vectors) -> None:
+    """The same for rays to a light, whose shadows not everything may cast; but glass always does. A probe's own set
+    goes before that."""
+    shift = world.lights.caster_shift[which] if mask & OPAQUE != 0 else 0
+    _visible(packet, world, (mask & ~CUTOUT) << shift, (mask & CUTOUT) << shift, seen)
+
+
+@inlined
+def _visible(packet: Packet, world: World, solid: int, cutout: int, seen: Vectors) -> None:
+    """`visible`, with a mask of its own for cut-outs."""
     handle = world.geometry.handle
     for lane in range(LANES):
         packet.ends[lane] = packet.rays[T_FAR, lane]
         packet.shadowed[lane] = packet.valid[lane]
         put(seen, lane, (1.0, 1.0, 1.0))
-        packet.words[MASK, lane] = mask & ~CUTOUT
+        packet.words[MASK, lane] = solid
     if not world.glass.walked:
         for lane in range(LANES):
             packet.words[MASK, lane] |= REFRACTIVE
@@ -141,7 +156,7 @@ def visible(packet: Packet, world: World, mask: int, seen: Vectors) -> None:
     _leave_out_blocked(packet, seen)
     if world.cutouts:
         for lane in range(LANES):
-            packet.words[MASK, lane] = mask & CUTOUT
+            packet.words[MASK, lane] = cutout
         intersect_world(packet, world, packet.ends, SCATTERED)
         _leave_out_blocked(packet, seen)
     if world.glass.walked:

@@ -6,12 +6,15 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from refract_core.scene import LightKind, Scene
+from refract_core.scene import LightKind, Scene, Shadow, Shaping
 
+from . import shaping
 from .vec import Vec, add, at, basis, clamp, cross, dot, length, mix, scaled, sub, unit, vec
 
 _DISK_CORNERS = 12
 """A disk's diffuse light is that of the regular polygon with its area."""
+_ARC_PIECES = 8
+"""The seen half of a cylinder's end is so many straight pieces."""
 
 
 class Lamp(NamedTuple):
@@ -27,6 +30,11 @@ class Lamp(NamedTuple):
     radiance: Vec
     diffuse: float
     specular: float
+    shaping: Shaping = Shaping()
+    shadows: bool = True
+    shadow: Shadow = Shadow()
+    lit: tuple[str, ...] | None = None
+    casters: tuple[str, ...] | None = None
 
 
 def lamps_of(scene: Scene, eye: Vec) -> list[Lamp]:
@@ -36,12 +44,15 @@ def lamps_of(scene: Scene, eye: Vec) -> list[Lamp]:
         half = 0.5 if light.kind in (LightKind.RECT, LightKind.DISTANT) else 1.0
         x, y, z, centre = (vec(m[:3, c]) for c in range(4))
         size = (light.size[0] * half, light.size[1] * half)
+        if light.kind is LightKind.CYLINDER:
+            size = (light.size[0], light.size[1] / 2.0)
         lamps.append(
-            Lamp(light.kind, x, y, scaled(z, -1.0), centre, size, light.radiance, light.diffuse, light.specular)
-        )
+            Lamp(light.kind, x, y, scaled(z, -1.0), centre, size, light.radiance, light.diffuse, light.specular,
+                 light.shaping, light.casts_shadow, light.shadow, light.lit, light.casters)
+        )  # fmt: skip
     if scene.camera_light:
         white = (math.pi,) * 3
-        lamps.append(Lamp(None, (1, 0, 0), (0, 1, 0), (0, 0, -1), eye, (0.0, 0.0), white, 1.0, 1.0))
+        lamps.append(Lamp(None, (1, 0, 0), (0, 1, 0), (0, 0, -1), eye, (0.0, 0.0), white, 1.0, 1.0, shadows=False))
     return lamps
 
 
@@ -59,11 +70,64 @@ def shadow_target(lamp: Lamp, p: Vec, u1: float, u2: float) -> tuple[Vec, float]
     target = lamp.centre
     if lamp.kind is LightKind.RECT:
         target = at(at(target, lamp.x, (2 * u1 - 1) * s), lamp.y, (2 * u2 - 1) * lamp.size[1])
+    elif lamp.kind is LightKind.CYLINDER:  # the rectangle through its axis that faces the place
+        _, _, w = _beside(lamp, p)
+        target = at(at(target, lamp.x, (2 * u1 - 1) * lamp.size[1]), cross(lamp.x, w), (2 * u2 - 1) * s)
     else:  # a disk as it is; of a sphere, the disk that it shows
         x, y = basis(unit(sub(p, lamp.centre))) if lamp.kind is LightKind.SPHERE else (lamp.x, lamp.y)
         target = at(at(target, x, s * disk[0]), y, s * disk[1])
     to = sub(target, p)
     return unit(to), length(to)
+
+
+def _beside(lamp: Lamp, p: Vec) -> tuple[float, float, Vec]:
+    """Of a cylinder from `p`: distance to its middle along it, to its axis across, and the unit way across."""
+    to = sub(lamp.centre, p)
+    ahead = dot(to, lamp.x)
+    off = at(to, lamp.x, -ahead)
+    return ahead, length(off), unit(off)
+
+
+# --- Shaping --------------------------------------------------------------------------------------------------------
+
+
+def tint(lamp: Lamp, p: Vec, n: Vec) -> Vec:
+    """What shaping leaves of the irradiance."""
+    if lamp.kind in (None, LightKind.DISTANT) or shaping.is_even(lamp.shaping):
+        return shaping.WHITE
+    assert lamp.kind is not None
+    a, b = lamp.size
+    if lamp.kind is LightKind.CYLINDER:
+        _, rho, w = _beside(lamp, p)
+        near = rho - math.pi / 4.0 * a  # a strip as far as its near half is on an average, seen as wide as it is
+        half = near * math.tan(math.asin(min(a / rho, 0.99995)))
+        place = shaping.Place(
+            False, at(lamp.centre, w, near - rho), scaled(lamp.x, b), scaled(cross(lamp.x, w), half), w
+        )
+    elif lamp.kind is LightKind.SPHERE:
+        w = unit(sub(lamp.centre, p))
+        sine = min(a / length(sub(lamp.centre, p)), 1.0)  # of the circle on which rays from `p` touch it
+        middle, radius = at(lamp.centre, w, -a * sine), a * math.sqrt(1.0 - sine * sine)
+        x, y = basis(scaled(w, -1.0))
+        place = shaping.Place(True, middle, scaled(x, radius), scaled(y, radius), w)
+    else:
+        b = b if lamp.kind is LightKind.RECT else a
+        away = scaled(lamp.face, -1.0)
+        place = shaping.Place(
+            lamp.kind is LightKind.DISK, lamp.centre, scaled(lamp.x, a), scaled(lamp.y, b), away
+        )
+    return shaping.mean(lamp.shaping, lamp.kind, place, (lamp.x, lamp.y, lamp.face), p, n)
+
+
+def mirrored_tint(lamp: Lamp, p: Vec, n: Vec, wo: Vec, alpha: float) -> Vec:
+    """And of the highlight."""
+    if lamp.kind in (None, LightKind.DISTANT) or shaping.is_even(lamp.shaping):
+        return shaping.WHITE
+    near = _nearest(lamp, p, sub(scaled(n, 2.0 * dot(n, wo)), wo))
+    half = (scaled(lamp.x, lamp.size[0]), scaled(lamp.y, lamp.size[1]))
+    axes = (lamp.x, lamp.y, lamp.face)
+    off = sub(near.to, sub(lamp.centre, p))
+    return shaping.mirrored(lamp.shaping, half, axes, near.to, off, alpha, near.radius)
 
 
 # --- Diffuse --------------------------------------------------------------------------------------------------------
@@ -81,6 +145,8 @@ def irradiance(lamp: Lamp, p: Vec, n: Vec) -> float:
         return cosine
     if lamp.kind is LightKind.SPHERE:
         return _of_sphere(cosine_of=dot(to, n) / distance, ratio=distance / s) if s > 0.0 else cosine / distance**2
+    if lamp.kind is LightKind.CYLINDER:
+        return _of_cylinder(lamp, p, n)
     if dot(to, lamp.face) >= 0.0:
         return 0.0
     if s == 0.0:
@@ -94,6 +160,34 @@ def irradiance(lamp: Lamp, p: Vec, n: Vec) -> float:
         angles = [step * k for k in range(_DISK_CORNERS)]
         corners = [add(scaled(lamp.x, grown * math.cos(t)), scaled(lamp.y, grown * math.sin(t))) for t in angles]
     return _of_polygon([add(to, c) for c in corners], n)
+
+
+def _of_cylinder(lamp: Lamp, p: Vec, n: Vec) -> float:
+    radius, half = lamp.size
+    ahead, rho, w = _beside(lamp, p)
+    if radius == 0.0:  # a line: cos_receiver sine / d^2 along what is above the horizon, by hand
+        up, lean = dot(w, n), dot(lamp.x, n)
+        ends = [ahead - half, ahead + half]
+        if abs(lean) > 0.0:
+            horizon = -rho * up / lean
+            ends = [max(ends[0], horizon), ends[1]] if lean > 0.0 else [ends[0], min(ends[1], horizon)]
+        if ends[0] >= ends[1] or (lean == 0.0 and up <= 0.0):
+            return 0.0
+
+        def below(t: float) -> float:
+            d2 = rho * rho + t * t
+            return up * (t / d2 + math.atan(t / rho) / rho) / 2.0 - lean * rho / d2 / 2.0
+
+        return max(0.0, below(ends[1]) - below(ends[0]))
+    if rho <= radius:
+        return 0.0
+    side, widest = cross(lamp.x, w), math.acos(radius / rho)
+    arc = []
+    for k in range(_ARC_PIECES + 1):  # of the circle around the axis, from where it is touched to where it is again
+        phi = widest * (2.0 * k / _ARC_PIECES - 1.0)
+        arc.append(at(scaled(w, rho - radius * math.cos(phi)), side, radius * math.sin(phi)))
+    one = [at(c, lamp.x, ahead + half) for c in arc]
+    return _of_polygon(one + [at(c, lamp.x, ahead - half) for c in reversed(arc)], n)
 
 
 def _of_polygon(corners: list[Vec], n: Vec) -> float:
@@ -193,6 +287,8 @@ def _nearest(lamp: Lamp, p: Vec, r: Vec) -> _Nearest:
         point = at(c, off, min(1.0, s / max(away, 1e-12)))
         solid = math.pi * s * s / d2 if s > 0.0 else 1.0 / d2
         return _Nearest(point, away <= s and dot(c, r) > 0.0, solid, s / math.sqrt(d2))
+    if lamp.kind is LightKind.CYLINDER:
+        return _nearest_of_cylinder(lamp, p, r)
     ahead = -dot(c, lamp.face)
     if ahead <= 0.0:
         return _Nearest(c, False, 0.0, 0.0)
@@ -210,3 +306,23 @@ def _nearest(lamp: Lamp, p: Vec, r: Vec) -> _Nearest:
         area = math.pi * s * s
     point = at(at(c, lamp.x, a), lamp.y, b)
     return _Nearest(point, inside, ahead / d2**1.5 * (area or 1.0), math.sqrt(area / math.pi / d2))
+
+
+def _nearest_of_cylinder(lamp: Lamp, p: Vec, r: Vec) -> _Nearest:
+    """From the axis' place nearest to the ray towards it (Karis 2013, tube lights)."""
+    radius, half = lamp.size
+    c = sub(lamp.centre, p)
+    ahead, rho, w = _beside(lamp, p)
+    if rho <= radius:
+        return _Nearest(c, False, 0.0, 0.0)
+    slope = dot(r, lamp.x)
+    bend = max(1.0 - slope * slope, 1e-9)
+    axis = at(c, lamp.x, clamp((dot(r, c) * slope - ahead) / bend, -half, half))
+    off = sub(scaled(r, dot(axis, r)), axis)
+    point = at(axis, off, min(1.0, radius / max(length(off), 1e-12)))
+    middle = rho * dot(w, r)
+    root = middle * middle - bend * (rho * rho - radius * radius)
+    meets = root >= 0.0 and middle > 0.0 and abs((middle - math.sqrt(root)) / bend * slope - ahead) <= half
+    d = math.hypot(rho, ahead)
+    solid = 2.0 * half * rho / d**3 * (2.0 * radius or 1.0)
+    return _Nearest(point, meets, solid, math.sqrt(solid / math.pi) if radius > 0.0 else 0.0)

@@ -71,11 +71,17 @@ class Shader:
             bits = ray_bits(o, d)
         return opacity > sampling.hashed(bits[0], bits[1], bits[2] ^ hit.face.part) / 2**32
 
-    def _arrives(self, surface: Surface, d: Vec, distance: float) -> Vec:
+    def _arrives(self, surface: Surface, d: Vec, distance: float, casters: tuple[str, ...] | None = None) -> Vec:
         """Share of a light's point, straight through all glass on the way: what each wall lets pass, with air on its
-        other side, and what bodies absorb between one wall and the next."""
+        other side, and what bodies absorb between one wall and the next. `casters`: what is opaque and may be in the
+        way; None: everything."""
+
+        def stands(hit: Hit) -> bool:
+            named = casters is None or hit.face.shape.path in casters
+            return named and self.present(hit, surface.point, d, None)
+
         o, far = surface.point, distance * (1.0 - 1e-4)
-        if self.nearest(o, d, OPAQUE, far) is not None:
+        if first(self.world.candidates(o, d, NEAR, far, OPAQUE), stands) is not None:
             return ZERO
         share, begun = (1.0, 1.0, 1.0), 0.0
         for hit in all_present(self.world.candidates(o, d, NEAR, far, GLASS), lambda h: self.present(h, o, d, None)):
@@ -100,6 +106,11 @@ class Shader:
             share = scaled(mul(share, left), clear)
         return share
 
+    def path_of(self, thing: int) -> str:
+        scene = self.scene
+        of = scene.meshes[thing] if thing < len(scene.meshes) else scene.spheres[thing - len(scene.meshes)]
+        return of.path
+
     # --- Light ---
 
     def gather(self, s: Surface, key: Key, sample: int, mirrored: Vec | None = None) -> Gathered:
@@ -108,20 +119,30 @@ class Shader:
         fresnel = mirrored or _lowered_schlick(s)
         coat = s.coat * (0.04 + 0.96 * (1.0 - clamp(dot(s.ns, s.wo))) ** 5)
         for k, lamp in enumerate(self.lamps):
+            if lamp.lit is not None and self.path_of(s.thing) not in lamp.lit:
+                continue
             even = lights.irradiance(lamp, s.point, s.ns) * lamp.diffuse
             gloss = lights.highlight(lamp, s.point, s.ns, s.wo, s.roughness**2) * lamp.specular
             over = coat * lights.highlight(lamp, s.point, s.ns, s.wo, s.coat_roughness**2) * lamp.specular
             if even + gloss + over <= 0.0:
                 continue
-            if lamp.kind is not None:
+            share = (1.0, 1.0, 1.0)
+            if lamp.shadows:
                 u1, u2 = sampling.pair(key, sample, sampling.FIRST_LIGHT + k)
                 d, distance = lights.shadow_target(lamp, s.point, u1, u2)
-                share = self._arrives(s, d, distance)
-            else:
-                share = (1.0, 1.0, 1.0)
-            radiance = mul(lamp.radiance, share)
-            irradiance = add(irradiance, scaled(radiance, even))
-            highlights = add(highlights, mul(radiance, vec([gloss * f + over for f in fresnel])))
+                shadow = lamp.shadow
+                if shadow.distance < math.inf:
+                    u = sampling.pair(key, sample, sampling.SHADOW_LENGTH)[0]
+                    distance = min(distance, shadow.distance - shadow.falloff * u ** (1.0 / shadow.gamma))
+                share = self._arrives(s, d, distance, lamp.casters)
+            dark = lamp.shadow.color
+            arrives = mul(lamp.radiance, vec([dark[c] + (1.0 - dark[c]) * share[c] for c in range(3)]))
+            irradiance = add(irradiance, scaled(mul(arrives, lights.tint(lamp, s.point, s.ns)), even))
+            base = vec([gloss * f for f in fresnel])
+            for weight, roughness in ((base, s.roughness), ((over,) * 3, s.coat_roughness)):
+                if max(weight) > 0.0:
+                    shape = lights.mirrored_tint(lamp, s.point, s.ns, s.wo, roughness**2)
+                    highlights = add(highlights, mul(mul(arrives, shape), weight))
         seen = ZERO
         if self.sky is not None:
             d, share = self._sky_direction(self.sky, s.ns, key, sample)

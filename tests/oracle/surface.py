@@ -33,6 +33,8 @@ class Surface(NamedTuple):
     coat: float
     coat_roughness: float
     occlusion: float
+    thing: int
+    """number of its prim"""
 
 
 def surface_at(scene: Scene, hit: Hit, wo: Vec) -> Surface:
@@ -54,7 +56,7 @@ def surface_at(scene: Scene, hit: Hit, wo: Vec) -> Surface:
     return Surface(
         hit.point, ng, ns, wo, kept, f0, color(scene, hit, m, Param.EMISSIVE), roughness,
         clamp(number(scene, hit, m, Param.CLEARCOAT)), clamp(number(scene, hit, m, Param.CLEARCOAT_ROUGHNESS)),
-        clamp(number(scene, hit, m, Param.OCCLUSION)),
+        clamp(number(scene, hit, m, Param.OCCLUSION)), hit.face.thing,
     )  # fmt: skip
 
 

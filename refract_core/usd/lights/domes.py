@@ -16,8 +16,9 @@ from pxr import Usd, UsdGeom, UsdLux
 from ...errors import ImageError
 from ...scene import F32, F64, Environment, Notice, Texture
 from ..materials.textures import read_texture, resolve_asset
+from .formats import FORMS, as_latlong, format_of
 
-_FORMATS = ("automatic", "latlong")
+_FORMATS = ("automatic", "latlong", *FORMS)
 _ROWS_AT_ONCE = 64
 
 
@@ -58,15 +59,21 @@ def read_dome(
     pixels = None
     if file:
         if texture_format not in _FORMATS:
-            notices.append(Notice(path, f"inputs:texture:format '{texture_format}' is not read; the light is skipped; "
-                                        f"convert the map to latlong"))  # fmt: skip
-            return None
+            notices.append(Notice(path, f"inputs:texture:format '{texture_format}' is none of {', '.join(_FORMATS)}; "
+                                        "automatic is used"))  # fmt: skip
+            texture_format = "automatic"
         try:
             pixels = linear(read_texture(file, "auto"))
         except ImageError as error:
             notices.append(Notice(path, f"dome texture cannot be read: {error}; the light is skipped"))
             return None
-        pixels = _finite(pixels, path, notices)
+        pixels = finite(pixels, path, notices, "dome texture")
+        form = format_of(pixels, texture_format)
+        if texture_format == "automatic" and form != "latlong":
+            height, width = pixels.shape[:2]
+            text = f"a dome texture of {width} x {height} is read as {form}; author inputs:texture:format if it is not"
+            notices.append(Notice(path, text))
+        pixels = as_latlong(pixels, form)
     turned = rotation(world_from_light[:3, :3]) @ _pole(prim, notices)
     return Dome(np.asarray(radiance, np.float32), pixels, turned)
 
@@ -160,12 +167,12 @@ def _pole(prim: Usd.Prim, notices: list[Notice]) -> F64:
     return np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
-def _finite(pixels: F32, path: str, notices: list[Notice]) -> F32:
+def finite(pixels: F32, path: str, notices: list[Notice], what: str) -> F32:
     """NaN becomes black and infinity the largest finite value of the map."""
     bad = ~np.isfinite(pixels)
     if not bad.any():
         return pixels
     count = int(bad.any(axis=-1).sum())
-    notices.append(Notice(path, f"dome texture has {count} pixel(s) that are NaN or infinite; they are replaced"))
+    notices.append(Notice(path, f"{what} has {count} pixel(s) that are NaN or infinite; they are replaced"))
     largest = float(pixels[~bad].max(initial=0.0))
     return np.nan_to_num(pixels, nan=0.0, posinf=largest, neginf=0.0)

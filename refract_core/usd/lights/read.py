@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from pxr import Usd, UsdGeom, UsdLux
 
 from ...scene import F64, Environment, Light, LightKind, Notice
+from ...world.embree import CASTER_SHIFTS
+from .context import Context, note, number, value
 from .domes import Dome, read_dome, rotation, sum_domes
+from .emission import emission
+from .meshes import is_mesh_light
+from .shaping import is_linked, read_link, read_shadow, read_shaping
 
 _DOMES = ("DomeLight", "DomeLight_1")
-
-
-class Context(NamedTuple):
-    """What every reader of one light needs."""
-
-    time: Usd.TimeCode
-    xforms: UsdGeom.XformCache
-    engine_from_stage: F64
-    metres_per_unit: float
-    notices: list[Notice]
 
 
 class Shape(NamedTuple):
@@ -44,6 +40,7 @@ def read_lights(
     metres_per_unit: float,
     purposes: tuple[str, ...],
     notices: list[Notice],
+    drawn: Sequence[str] = (),
 ) -> tuple[tuple[Light, ...], Environment | None]:
     """Every visible light of the stage.
 
@@ -54,6 +51,7 @@ def read_lights(
         metres_per_unit: The scale in it; areas for `normalize` are in stage units.
         purposes: Purposes that are rendered.
         notices: What was ignored, replaced or guessed is added here.
+        drawn: Paths of all prims that are drawn, which lights may be linked to.
 
     Returns:
         Finite and distant lights in stage order, and all domes summed (None where there is none).
@@ -67,30 +65,46 @@ def read_lights(
             _note_instanced(prim, notices)
             prims.PruneChildren()
         elif prim.HasAPI(UsdLux.LightAPI) and _shown(prim, time, purposes):
-            _read_light(context, prim, lights, domes)
-    return tuple(lights), sum_domes(domes)
+            _read_light(context, prim, lights, domes, drawn)
+    return tuple(_few_casters(lights, notices)), sum_domes(domes)
 
 
-def _read_light(context: Context, prim: Usd.Prim, lights: list[Light], domes: list[Dome]) -> None:
+def _few_casters(lights: list[Light], notices: list[Notice]) -> list[Light]:
+    """No more different sets of what casts a light's shadows than rays have masks for."""
+    sets = list(dict.fromkeys(light.casters for light in lights if light.casters is not None))
+    kept = {None, *sets[: len(CASTER_SHIFTS)]}
+    for light in lights:
+        if light.casters not in kept:
+            text = f"more than {len(CASTER_SHIFTS)} different collections 'shadowLink' in one stage; everything casts "
+            notices.append(Notice(light.path, f"{text}this light's shadows. Let several lights share one collection"))
+    return [light if light.casters in kept else replace(light, casters=None) for light in lights]
+
+
+def _read_light(
+    context: Context, prim: Usd.Prim, lights: list[Light], domes: list[Dome], drawn: Sequence[str]
+) -> None:
     """Add one light prim to `lights` or `domes`, or a notice."""
     name = str(prim.GetTypeName())
     if name not in ROWS and name not in _DOMES:
         label = "MeshLightAPI" if prim.HasAPI(UsdLux.MeshLightAPI) else name or "LightAPI"
+        if is_mesh_light(prim):
+            note(context, prim, f"{label} glows, but lights nothing else")
+            return
         hint = " (sampling of the dome goes on without it)" if name == "PortalLight" else ""
-        _note(context, prim, f"{label} is ignored: it is not rendered as a light{hint}")
+        note(context, prim, f"{label} is ignored: it is not rendered as a light{hint}")
         return
     light = UsdLux.LightAPI(prim)
-    emission = _emission(context, light)
-    if emission is None:
+    shining = emission(context, light)
+    if shining is None:
         return
     _note_ignored(context, prim)
     world_from_light = context.engine_from_stage @ np.array(context.xforms.GetLocalToWorldTransform(prim), np.float64).T
     if not np.isfinite(world_from_light).all():
-        _note(context, prim, "has a transform with NaN or infinity; the light is skipped; repair its xformOps")
+        note(context, prim, "has a transform with NaN or infinity; the light is skipped; repair its xformOps")
         return
     if name in _DOMES:
         dome = read_dome(
-            light, context.time, radiance=emission, world_from_light=world_from_light, notices=context.notices
+            light, context.time, radiance=shining, world_from_light=world_from_light, notices=context.notices
         )
         if dome is not None:
             domes.append(dome)
@@ -99,7 +113,8 @@ def _read_light(context: Context, prim: Usd.Prim, lights: list[Light], domes: li
     shape = row.read(context, prim, world_from_light)
     if shape is None:
         return
-    r, g, b = (value * shape.factor for value in emission)
+    r, g, b = (channel * shape.factor for channel in shining)
+    casts_shadow, shadow = read_shadow(context, prim)
     lights.append(
         Light(
             path=str(prim.GetPath()),
@@ -107,14 +122,15 @@ def _read_light(context: Context, prim: Usd.Prim, lights: list[Light], domes: li
             radiance=(r, g, b),
             world_from_light=shape.world_from_light,
             size=shape.size,
-            diffuse=_number(context, prim, "inputs:diffuse", 1.0),
-            specular=_number(context, prim, "inputs:specular", 1.0),
+            diffuse=number(context, prim, "inputs:diffuse", 1.0),
+            specular=number(context, prim, "inputs:specular", 1.0),
+            shaping=read_shaping(context, prim, row.kind, _turn(world_from_light)[1]),
+            casts_shadow=casts_shadow,
+            shadow=shadow,
+            lit=read_link(context, prim, "lightLink", drawn),
+            casters=read_link(context, prim, "shadowLink", drawn) if casts_shadow else None,
         )
     )
-
-
-def _note(context: Context, prim: Usd.Prim, text: str) -> None:
-    context.notices.append(Notice(str(prim.GetPath()), text))
 
 
 def _shown(prim: Usd.Prim, time: Usd.TimeCode, purposes: tuple[str, ...]) -> bool:
@@ -125,57 +141,9 @@ def _shown(prim: Usd.Prim, time: Usd.TimeCode, purposes: tuple[str, ...]) -> boo
     return visible and str(imageable.ComputePurpose()) in purposes
 
 
-def _value(context: Context, prim: Usd.Prim, name: str, default: Any) -> Any:
-    attribute = prim.GetAttribute(name)
-    value = attribute.Get(context.time) if attribute else None
-    return default if value is None else value
-
-
-def _number(context: Context, prim: Usd.Prim, name: str, default: float) -> float:
-    """A finite number >= 0; anything else becomes `default` with a notice."""
-    value = float(_value(context, prim, name, default))
-    if math.isfinite(value) and value >= 0.0:
-        return value
-    _note(context, prim, f"{name} is {value}; the valid range is at least 0; {default} is used")
-    return default
-
-
-def _emission(context: Context, light: UsdLux.LightAPI) -> tuple[float, float, float] | None:
-    """color * intensity * 2^exposure * colour temperature (UsdLuxLightAPI); None with a notice where it is no number.
-
-    `normalize` is not in it: it needs the light's shape.
-    """
-    prim = light.GetPrim()
-    intensity = float(_value(context, prim, "inputs:intensity", 1.0))
-    exposure = float(_value(context, prim, "inputs:exposure", 0.0))
-    color = np.array(_value(context, prim, "inputs:color", (1.0, 1.0, 1.0)), np.float64)
-    with np.errstate(over="ignore", invalid="ignore"):
-        emission = color * intensity * np.exp2(exposure) * _temperature(context, prim)
-    if not np.isfinite(emission).all() or (emission < 0.0).any() or float(emission.max()) > 1e30:
-        shown = tuple(color.tolist())
-        _note(context, prim, f"intensity {intensity}, exposure {exposure}, color {shown} is no finite positive "
-                             "emission; the light is skipped; author values of at least 0")  # fmt: skip
-        return None
-    return (float(emission[0]), float(emission[1]), float(emission[2]))
-
-
-def _temperature(context: Context, prim: Usd.Prim) -> F64:
-    """Colour of a black body [linear BT.709], shape (3,), 1 where the light does not ask for one."""
-    if not _value(context, prim, "inputs:enableColorTemperature", False):
-        return np.ones(3)
-    kelvin = float(_value(context, prim, "inputs:colorTemperature", 6500.0))
-    low, high = 1000.0, 10000.0  # as UsdLux has it
-    if not low <= kelvin <= high:  # usd-core 26.11 crashes on NaN
-        used = min(max(kelvin, low), high) if math.isfinite(kelvin) else 6500.0
-        _note(context, prim, f"inputs:colorTemperature is {kelvin}; the valid range is {low:g} to {high:g} K; "
-                             f"{used:g} is used")  # fmt: skip
-        kelvin = used
-    return np.array(UsdLux.BlackbodyTemperatureAsRgb(kelvin), np.float64)
-
-
 def _factor(context: Context, prim: Usd.Prim, area: float) -> float:
     """1 / sizeFactor: one, or with `normalize` one over the surface area; `area` in m^2, sizeFactor in stage units."""
-    if not _value(context, prim, "inputs:normalize", False):
+    if not value(context, prim, "inputs:normalize", False):
         return 1.0
     return context.metres_per_unit**2 / area
 
@@ -186,15 +154,21 @@ def _factor(context: Context, prim: Usd.Prim, area: float) -> float:
 def _frame(matrix: F64) -> F64:
     """Rotation and translation of a 4x4 whose -Z is kept as the emission axis; mirroring is turned into X."""
     frame = np.eye(4)
+    frame[:3, :3] = _turn(matrix)[0]
+    frame[:3, 3] = matrix[:3, 3]
+    return frame
+
+
+def _turn(matrix: F64) -> tuple[F64, bool]:
+    """The rotation in a 4x4, and whether X had to be turned around for it."""
     axes = matrix[:3, :3].copy()
     if not axes[:, 2].any():  # flattened along its own axis, which a rectangle or disk survives
         axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
     turned = rotation(axes)
-    if np.linalg.det(turned) < 0.0:
+    mirrored = bool(np.linalg.det(turned) < 0.0)
+    if mirrored:
         turned[:, 0] = -turned[:, 0]
-    frame[:3, :3] = turned
-    frame[:3, 3] = matrix[:3, 3]
-    return frame
+    return turned, mirrored
 
 
 def _scales(context: Context, prim: Usd.Prim, matrix: F64, axes: int) -> list[float]:
@@ -204,7 +178,7 @@ def _scales(context: Context, prim: Usd.Prim, matrix: F64, axes: int) -> list[fl
     gram = columns[:, :axes].T @ columns[:, :axes]
     off = float(np.abs(gram - np.diag(np.diag(gram))).max()) if axes > 1 else 0.0
     if off > 1e-4 * max(lengths) ** 2:
-        _note(context, prim, "is sheared by its transform; the shear is ignored")
+        note(context, prim, "is sheared by its transform; the shear is ignored")
     return lengths
 
 
@@ -212,30 +186,30 @@ def _even(context: Context, prim: Usd.Prim, lengths: list[float], what: str) -> 
     """One scale for a round light; the mean that keeps its area or volume where the axes differ."""
     mean = math.prod(lengths) ** (1.0 / len(lengths))
     if max(lengths) - min(lengths) > 1e-4 * max(lengths):
-        _note(context, prim, f"has a non-uniform scale; the {what} is read as round with the mean radius")
+        note(context, prim, f"has a non-uniform scale; the {what} is read as round with the mean radius")
     return mean
 
 
 def _sphere(context: Context, prim: Usd.Prim, matrix: F64) -> Shape | None:
     """A sphere; with treatAsPoint or radius 0 a point, of the radiant intensity L * pi * r^2 of that sphere."""
     scale = _even(context, prim, _scales(context, prim, matrix, 3), "sphere")
-    radius = _number(context, prim, "inputs:radius", 0.5) * scale
-    if radius > 0.0 and not _value(context, prim, "treatAsPoint", False):
+    radius = number(context, prim, "inputs:radius", 0.5) * scale
+    if radius > 0.0 and not value(context, prim, "treatAsPoint", False):
         area = 4.0 * math.pi * radius**2
         return Shape(_frame(matrix), (radius, 0.0), _factor(context, prim, area))
-    if _value(context, prim, "inputs:normalize", False):
+    if value(context, prim, "inputs:normalize", False):
         return Shape(_frame(matrix), (0.0, 0.0), 0.25 * context.metres_per_unit**2)
     if radius > 0.0:
         return Shape(_frame(matrix), (0.0, 0.0), math.pi * radius**2)
-    _note(context, prim, "has radius 0 and inputs:normalize off, which gives no light; it is read as if normalize "
+    note(context, prim, "has radius 0 and inputs:normalize off, which gives no light; it is read as if normalize "
                          "were on; author inputs:normalize = 1")  # fmt: skip
     return Shape(_frame(matrix), (0.0, 0.0), 0.25 * context.metres_per_unit**2)
 
 
 def _rect(context: Context, prim: Usd.Prim, matrix: F64) -> Shape | None:
     sx, sy = _scales(context, prim, matrix, 2)
-    width = _number(context, prim, "inputs:width", 1.0) * sx
-    height = _number(context, prim, "inputs:height", 1.0) * sy
+    width = number(context, prim, "inputs:width", 1.0) * sx
+    height = number(context, prim, "inputs:height", 1.0) * sy
     if width * height <= 0.0:
         _note_no_area(context, prim, "inputs:width and inputs:height")
         return None
@@ -244,7 +218,7 @@ def _rect(context: Context, prim: Usd.Prim, matrix: F64) -> Shape | None:
 
 def _disk(context: Context, prim: Usd.Prim, matrix: F64) -> Shape | None:
     scale = _even(context, prim, _scales(context, prim, matrix, 2), "disk")
-    radius = _number(context, prim, "inputs:radius", 0.5) * scale
+    radius = number(context, prim, "inputs:radius", 0.5) * scale
     if radius <= 0.0:
         _note_no_area(context, prim, "inputs:radius")
         return None
@@ -252,18 +226,37 @@ def _disk(context: Context, prim: Usd.Prim, matrix: F64) -> Shape | None:
 
 
 def _note_no_area(context: Context, prim: Usd.Prim, names: str) -> None:
-    _note(context, prim, f"has no area, so it gives no light and is skipped; author {names} above 0")
+    note(context, prim, f"has no area, so it gives no light and is skipped; author {names} above 0")
+
+
+def _cylinder(context: Context, prim: Usd.Prim, matrix: F64) -> Shape | None:
+    """A tube about its X; with treatAsLine or radius 0 a line, of the radiance times the width of that tube."""
+    along, *around = _scales(context, prim, matrix, 3)
+    length = number(context, prim, "inputs:length", 1.0) * along
+    radius = number(context, prim, "inputs:radius", 0.5) * _even(context, prim, around, "cylinder")
+    if length <= 0.0:
+        _note_no_area(context, prim, "inputs:length")
+        return None
+    if radius > 0.0 and not value(context, prim, "treatAsLine", False):
+        return Shape(_frame(matrix), (radius, length), _factor(context, prim, 2.0 * math.pi * radius * length))
+    if radius <= 0.0 and not value(context, prim, "inputs:normalize", False):
+        note(context, prim, "has radius 0 and inputs:normalize off, which gives no light; it is read as if normalize "
+                            "were on; author inputs:normalize = 1")  # fmt: skip
+    # Radiance times width: 2 r, or with `normalize` 2 r over the area 2 pi r length, whatever r is.
+    normalized = radius <= 0.0 or value(context, prim, "inputs:normalize", False)
+    width = context.metres_per_unit**2 / (math.pi * length) if normalized else 2.0 * radius
+    return Shape(_frame(matrix), (0.0, length), width)
 
 
 def _distant(context: Context, prim: Usd.Prim, matrix: F64) -> Shape | None:
     """sizeFactor of UsdLuxLightAPI: pi sin^2(angle / 2), or pi (2 - sin^2) beyond a half angle of 90 degrees."""
-    degrees = min(_number(context, prim, "inputs:angle", 0.53), 360.0)
+    degrees = min(number(context, prim, "inputs:angle", 0.53), 360.0)
     half = math.radians(degrees) / 2.0
     size_factor = 1.0
     if half > 0.0:
         square = math.sin(half) ** 2
         size_factor = math.pi * (square if half <= math.pi / 2.0 else 2.0 - square)
-    normalize = bool(_value(context, prim, "inputs:normalize", False))
+    normalize = bool(value(context, prim, "inputs:normalize", False))
     return Shape(_frame(matrix), (2.0 * half, 0.0), 1.0 / size_factor if normalize else 1.0)
 
 
@@ -273,17 +266,16 @@ class Row(NamedTuple):
     kind: LightKind
     read: Callable[[Context, Usd.Prim, F64], Shape | None]
     """(context, prim, engine world from light) -> place and size; None with a notice where it gives no light"""
-    cone: float
-    """Half angle of the cone it shines into by itself [degrees]: a narrower one cuts something off."""
 
 
 ROWS = {
     row.kind.usd_type: row
     for row in (
-        Row(LightKind.DISTANT, _distant, 90.0),
-        Row(LightKind.SPHERE, _sphere, 180.0),
-        Row(LightKind.RECT, _rect, 90.0),
-        Row(LightKind.DISK, _disk, 90.0),
+        Row(LightKind.DISTANT, _distant),
+        Row(LightKind.SPHERE, _sphere),
+        Row(LightKind.RECT, _rect),
+        Row(LightKind.DISK, _disk),
+        Row(LightKind.CYLINDER, _cylinder),
     )
 }
 """By the prims' type."""
@@ -294,58 +286,46 @@ ROWS = {
 
 def _note_ignored(context: Context, prim: Usd.Prim) -> None:
     """One notice per thing that is authored on the light and not rendered."""
-    for what in [*_ignored_shaping(context, prim), *_ignored_links(prim), *_ignored_inputs(context, prim)]:
-        _note(context, prim, f"{what} is ignored; the light shines without it")
+    dome = prim.GetTypeName() in _DOMES
+    found = _ignored_on_domes(context, prim) if dome else []
+    if dome or prim.GetTypeName() == LightKind.DISTANT.usd_type:
+        found += _ignored_shaping(context, prim)
+    for name in ("light:filters", "portals"):
+        relationship = prim.GetRelationship(name)
+        if relationship and relationship.GetTargets():
+            found.append(name)
+    for attribute in prim.GetAttributes():
+        if attribute.GetName().startswith("inputs:") and attribute.HasAuthoredConnections():
+            found.append(f"connection of {attribute.GetName()}")
+    for what in found:
+        note(context, prim, f"{what} is ignored; the light shines without it")
 
 
 def _ignored_shaping(context: Context, prim: Usd.Prim) -> list[str]:
-    """Names of what shapes a light elsewhere and is authored here."""
+    """Names of what shapes other lights and is authored on a sun or a sky, for which UsdLux does not say what it is."""
     found = []
-    row = ROWS.get(str(prim.GetTypeName()))
-    if float(_value(context, prim, "inputs:shaping:cone:angle", 180.0)) < (row.cone if row else 90.0):
+    if float(value(context, prim, "inputs:shaping:cone:angle", 180.0)) < 90.0:
         found.append("inputs:shaping:cone:angle")
-    if float(_value(context, prim, "inputs:shaping:focus", 0.0)) > 0.0:
+    if float(value(context, prim, "inputs:shaping:focus", 0.0)) > 0.0:
         found.append("inputs:shaping:focus")
-    asset = _value(context, prim, "inputs:shaping:ies:file", None)
+    asset = value(context, prim, "inputs:shaping:ies:file", None)
     if asset is not None and asset.path:
         found.append("inputs:shaping:ies:file")
     return found
 
 
-def _ignored_links(prim: Usd.Prim) -> list[str]:
-    """Names of what leaves objects or portals out elsewhere and is authored here."""
-    found = []
-    for name in ("lightLink", "shadowLink"):
-        prefix = f"collection:{name}"
-        include = prim.GetAttribute(f"{prefix}:includeRoot")
-        partial = bool(include) and include.Get() is False
-        listed = [prim.GetRelationship(f"{prefix}:{end}") for end in ("includes", "excludes")]
-        if partial or any(rel and rel.GetTargets() for rel in listed):
-            found.append(f"{prefix} (light linking)")
-    for name in ("light:filters", "portals"):
-        relationship = prim.GetRelationship(name)
-        if relationship and relationship.GetTargets():
-            found.append(name)
-    return found
-
-
-def _ignored_inputs(context: Context, prim: Usd.Prim) -> list[str]:
-    """Names of other inputs that are authored and not rendered."""
-    found = []
-    if _value(context, prim, "inputs:shadow:enable", True) is False:
+def _ignored_on_domes(context: Context, prim: Usd.Prim) -> list[str]:
+    """Names of what other lights have and skies do not: all domes are one, and shine on everything alike."""
+    found = [f"collection:{name} (light linking)" for name in ("lightLink", "shadowLink") if is_linked(prim, name)]
+    if value(context, prim, "inputs:shadow:enable", True) is False:
         found.append("inputs:shadow:enable = 0")
-    if any(float(c) != 0.0 for c in _value(context, prim, "inputs:shadow:color", (0.0, 0.0, 0.0))):
+    if any(float(c) != 0.0 for c in value(context, prim, "inputs:shadow:color", (0.0, 0.0, 0.0))):
         found.append("inputs:shadow:color")
-    asset = _value(context, prim, "inputs:texture:file", None)
-    if prim.GetTypeName() not in _DOMES and asset is not None and asset.path:
-        found.append("inputs:texture:file")
-    if prim.GetTypeName() in _DOMES:
-        for name in ("inputs:diffuse", "inputs:specular"):
-            if float(_value(context, prim, name, 1.0)) != 1.0:
-                found.append(name)
-    for attribute in prim.GetAttributes():
-        if attribute.GetName().startswith("inputs:") and attribute.HasAuthoredConnections():
-            found.append(f"connection of {attribute.GetName()}")
+    if float(value(context, prim, "inputs:shadow:distance", -1.0)) >= 0.0:
+        found.append("inputs:shadow:distance")
+    for name in ("inputs:diffuse", "inputs:specular"):
+        if float(value(context, prim, name, 1.0)) != 1.0:
+            found.append(name)
     return found
 
 

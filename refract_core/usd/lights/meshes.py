@@ -1,0 +1,86 @@
+"""Meshes that are lights (MeshLightAPI, GeometryLight): drawn as what glows by the light's inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade
+
+from ...scene import Material, Mesh, Notice, Param, Source
+from .context import Context, note, value
+from .emission import emission
+
+_BLACK: dict[Param, tuple[float, ...]] = {
+    Param.EMISSIVE: (0.0, 0.0, 0.0), Param.ROUGHNESS: (1.0,), Param.OPACITY: (1.0,), Param.IOR: (1.0,),
+    Param.NORMAL: (0.0, 0.0, 1.0), Param.OCCLUSION: (1.0,),
+}  # fmt: skip
+"""A surface that sends nothing back; what is not here is 0."""
+
+
+def is_mesh_light(prim: Usd.Prim) -> bool:
+    """A mesh that shines, or what says so of one."""
+    on_mesh = prim.GetTypeName() == "Mesh" and prim.HasAPI(UsdLux.LightAPI)
+    return bool(on_mesh or prim.GetTypeName() == "GeometryLight")
+
+
+def glowing(
+    stage: Usd.Stage, time: Usd.TimeCode, meshes: tuple[Mesh, ...], materials: list[Material],
+    *, metres_per_unit: float, notices: list[Notice],
+) -> tuple[Mesh, ...]:  # fmt: skip
+    """The meshes, of which those that are lights have a material of their own, added to `materials`.
+
+    What `light:materialSyncMode` leaves to the bound material shows that: its own glow, whatever the light says. A mesh
+    without material has nothing to tint, so it glows as the light says.
+    """
+    context = Context(time, UsdGeom.XformCache(time), np.eye(4), metres_per_unit, notices)
+    lights: dict[str, Usd.Prim] = {}
+    for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
+        if is_mesh_light(prim):
+            for path in _targets(prim):
+                if _own_glow(stage.GetPrimAtPath(path), prim):
+                    lights[str(path)] = prim
+    if not lights:
+        return meshes
+    return tuple(_lit(context, mesh, lights.get(mesh.path.partition("/[")[0]), materials) for mesh in meshes)
+
+
+def _targets(prim: Usd.Prim) -> Sequence[Sdf.Path]:
+    if prim.GetTypeName() != "GeometryLight":
+        return [prim.GetPath()]
+    relationship = prim.GetRelationship("geometry")
+    return list(relationship.GetTargets()) if relationship else []
+
+
+def _own_glow(mesh: Usd.Prim, light: Usd.Prim) -> bool:
+    """Nothing but the light says how the mesh looks."""
+    mode = light.GetAttribute("light:materialSyncMode")
+    if mode and mode.Get() == "noMaterialResponse":
+        return True
+    return bool(mesh) and not UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()[0]
+
+
+def _lit(context: Context, mesh: Mesh, light: Usd.Prim | None, materials: list[Material]) -> Mesh:
+    found = emission(context, UsdLux.LightAPI(light)) if light is not None else None
+    if light is None or found is None or not len(mesh.triangles):
+        return mesh
+    a, b, c = (mesh.points.astype(np.float64)[mesh.triangles[:, k]] for k in range(3))
+    area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2.0
+    factor = 1.0
+    if value(context, light, "inputs:normalize", False):
+        if area <= 0.0:
+            note(context, light, "has no area, so it gives no light; it is drawn without")
+            return mesh
+        factor = context.metres_per_unit**2 / area
+    r, g, b_ = (channel * factor for channel in found)
+    inputs = {param: Source(_four(_BLACK.get(param, (0.0,)))) for param in Param}
+    inputs[Param.EMISSIVE] = Source((r, g, b_, 1.0))
+    materials.append(Material(str(light.GetPath()), tuple(inputs[param] for param in Param)))
+    return replace(mesh, materials=np.full(len(mesh.triangles), len(materials) - 1, np.int32))
+
+
+def _four(values: tuple[float, ...]) -> tuple[float, float, float, float]:
+    if len(values) == 1:
+        return (values[0],) * 4
+    return (values[0], values[1], values[2], 1.0)
