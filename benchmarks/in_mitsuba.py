@@ -35,7 +35,7 @@ class Light(StrEnum):
 
     STRAIGHT = "straight"
     """Nothing: glass casts no shadow and no caustic, and the lamp is seen only as the highlight on the outside of
-    glass. That is the engine's model."""
+    glass. It tells, beside the next, what caustics touch."""
     WORLD = "world"
     """All it does: shadows, caustics, the lamp through glass. Only matt surfaces still do not light each other."""
     PATH = "path"

@@ -13,12 +13,10 @@ measured beyond it. Every number in dB is the PSNR of sRGB pictures, clipped as 
                 picture is the same to 1/255 whether glass lets light straight through or does with it what glass does
     touched     the rest: shadows and caustics of glass
 
-In the lit room matt surfaces do not light each other, in either program (`benchmarks.in_mitsuba`). There both are
-compared with a truth in which light goes straight through glass to what it lights, and the lamp itself is seen in the
-outside of glass alone, for that is what the engine means to draw; Mitsuba draws just that too, with less noise than it
-would have with caustics. What is left out so is measured once: the rows "all glass does" hold our best picture, and
-that truth, against a truth with everything that glass does to light. "Mitsuba path" is Mitsuba as anybody would use it,
-with caustics and light between surfaces, against its own converged picture.
+In the lit room matt surfaces do not light each other, in either program (`benchmarks.in_mitsuba`), and the truth is all
+that glass does to light: shadows, caustics, and the lamp seen through glass, which the engine shows in the outside of
+glass alone. A second truth, in which light goes straight through, tells which pixels caustics touch. "Mitsuba path" is
+Mitsuba as anybody would use it, with light between surfaces, too, against its own converged picture.
 
 Seconds are the median of the repeats, after a first time that is not counted, both programs by turns on all cores. Ours
 build the scene's tables and its hierarchy in every frame; Mitsuba's scene is loaded before, but it goes through its
@@ -106,11 +104,7 @@ class Measured(NamedTuple):
 
     runs: list[Run]
     best: Run
-    picture: F32
-    """the best one, linear"""
     truth: Truth
-    world: Truth | None
-    """where there is a lamp: with all that glass does to its light"""
     regions: dict[str, Mask]
     smallest: dict[str, float]
     """program -> seconds of a picture of 16 x 9 pixels with one sample"""
@@ -196,10 +190,11 @@ def measure(mi: Any, room: Room, options: Options) -> Measured:
     truths = {
         light: converged(room, light, loaded, options.reference_samples, options.cache, _tell) for light in wanted
     }
-    truth, world = truths[Light.STRAIGHT], truths.get(Light.WORLD)
-    regions = regions_of(truth.share, truth.linear, None if world is None else world.linear)
+    straight, drawn = truths[Light.STRAIGHT], Light.STRAIGHT if room.lamp is None else Light.WORLD
+    truth = truths[drawn]
+    regions = regions_of(straight.share, straight.linear, None if room.lamp is None else truth.linear)
     entrants = [Entrant(OURS, name, ours(room, options, LEVELS[name]), truth.linear) for name in options.levels]
-    for program, light in ((THEIRS, Light.STRAIGHT), (PATH, Light.PATH)):
+    for program, light in ((THEIRS, drawn), (PATH, Light.PATH)):
         if light in truths:
             own = truths[light].linear
             entrants += [Entrant(program, f"{n} spp", theirs(loaded, n, light), own) for n in options.mitsuba]
@@ -211,7 +206,7 @@ def measure(mi: Any, room: Room, options: Options) -> Measured:
         OURS: _timed(ours(room, tiny, LEVELS[options.levels[0]]))[1],
         THEIRS: _timed(theirs(load(mi, room, 16), 1))[1],
     }
-    return Measured(runs, best, picture, truth, world, regions, smallest)
+    return Measured(runs, best, truth, regions, smallest)
 
 
 def _tell(fraction: float, what: str) -> None:
@@ -237,12 +232,6 @@ def table(found: Measured) -> list[str]:
         lines.append(f"{run.program + ', ' + run.name:<28}{run.seconds:10.3f}" + _cells(run.scores))
     noise = {name: found.truth.noise(mask) if mask.any() else math.nan for name, mask in found.regions.items()}
     lines.append(f"{'noise of the truth itself':<38}" + _cells(noise))
-    if found.world is not None:
-        best = f"{found.best.program}, {found.best.name}"
-        pictures: dict[str, Picture] = {best: found.picture, "the truth": found.truth.linear}
-        for name, picture in pictures.items():
-            against = scores(picture, found.world.linear, found.regions)
-            lines.append(f"{name + ', all glass does':<38}" + _cells(against))
     shares = {name: 100.0 * float(mask.mean()) for name, mask in found.regions.items()}
     lines.append(f"{'share of the picture [%]':<38}" + _cells(shares))
     return lines
@@ -279,15 +268,14 @@ def report(room: Room, found: Measured, options: Options) -> list[str]:
 
 
 def plot(folder: Path, room: Room, found: Measured) -> list[Path]:
-    """Write a chart for every region but the one that is not ours to draw."""
+    """Write a chart for every region."""
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for region in found.regions:
-        if region != "touched":
-            path = folder / f"peers-{room.name}-{region}.svg"
-            chart = svg(f"{room.name} room, {region}: PSNR in dB", curves_of(found.runs, region))
-            path.write_text(chart, encoding="utf-8")
-            written.append(path)
+        path = folder / f"peers-{room.name}-{region}.svg"
+        chart = svg(f"{room.name} room, {region}: PSNR in dB", curves_of(found.runs, region))
+        path.write_text(chart, encoding="utf-8")
+        written.append(path)
     return written
 
 
