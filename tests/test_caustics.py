@@ -18,7 +18,7 @@ import refract_core as rc
 from refract_core.optics.arrays import fresnel_dielectric
 from refract_core.rendering.caustics import caustics_of, plan_caustics
 from refract_core.rendering.work import Work
-from refract_core.scene import LightKind, Material, Mesh, Model, Scene, Sphere
+from refract_core.scene import LightKind, Material, Mesh, Model, Scene, Shaping, Sphere
 from refract_core.world import environment, textures
 from refract_core.world.lamps import pack_lights
 from refract_core.world.tables import pack_geometry, pack_materials, world_of
@@ -34,6 +34,7 @@ BODIES: dict[str, Mesh | Sphere] = {
     "turned box": box("/body", (0.25, 0.2, 0.3), 1, turned((1, 2, 3), 35), centre=(0.0, 0.8, 0.0)),
     "ball": Sphere("/body", (0.0, 0.8, 0.05), 0.3, 1),
 }
+_PAINTED = np.array([[[3, 1, 0.5], [0.5, 1, 2]], [[0.5, 2, 1], [2, 1, 1]]], np.float32)
 LIGHTS: dict[str, dict[str, Any]] = {
     "sun": {"lights": (replace(SUN, size=(math.radians(2.0), 0.0)),)},
     "slanting sun": {"lights": (light(LightKind.DISTANT, (5, 9, 3), (-0.3, -1, -0.2), (0.02, 0.0), 900.0),)},
@@ -42,6 +43,13 @@ LIGHTS: dict[str, dict[str, Any]] = {
     "disk": {"lights": (light(LightKind.DISK, (0.0, 2.2, 0.0), (0, -1, 0), (0.3, 0.0), 8.0),)},
     "dome": {"environment": dome(0.7)},
 }
+UNEVEN: dict[str, dict[str, Any]] = {
+    "tube": {"lights": (light(LightKind.CYLINDER, (0.1, 2.0, 0.0), (0, -1, 0), (0.05, 0.8), 30.0),)},
+    "spot": {"lights": (replace(light(LightKind.DISK, (0.3, 2.2, 0.0), (-0.1, -1, 0), (0.2, 0.0), 20.0),
+                                shaping=Shaping(cone=0.5, softness=0.8, focus=4.0, focus_tint=(0.2, 0.4, 0.6))),)},
+    "painted panel": {"lights": (replace(light(LightKind.RECT, (0.3, 1.9, 0.0), (-0.1, -1, 0), (0.8, 0.5), 4.0),
+                                         shaping=Shaping(picture=_PAINTED)),)},
+}  # fmt: skip
 
 
 def under(fov: float, **fields: Any) -> Any:
@@ -73,6 +81,14 @@ def test_glass_of_index_one_changes_no_light(name: str, shape: str) -> None:
     assert np.sqrt(np.square(ratio - 1.0).mean()) < 0.05
     blocks = ratio.reshape(12, 4, 12, 4, 3).mean((1, 3))
     assert np.abs(blocks - 1.0).max() < 0.12
+
+
+@pytest.mark.parametrize("name", UNEVEN)
+def test_uneven_lights_lose_nothing_in_glass_of_index_one(name: str) -> None:
+    """Photons start as bright as the cone, the picture and the tube are from there, colour by colour."""
+    bare = arriving(lit(WHITE, [], **UNEVEN[name])).mean((0, 1))
+    through = arriving(lit(glass(Model.TRACED, 1.0), [BODIES["ball"]], **UNEVEN[name])).mean((0, 1))
+    assert through == pytest.approx(bare, rel=0.03)
 
 
 def test_a_lamp_in_a_body_shines_out_of_it() -> None:

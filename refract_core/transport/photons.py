@@ -28,7 +28,7 @@ from ..world.embree import OPAQUE, clear
 from ..world.environment import TEXEL_LUMINANCE, direction_pdf, irradiance, radiance, sample_direction
 from ..world.lights import irradiance_factor, shadow_ray
 from ..world.offsets import off_surface
-from ..world.shaping import shape_matt
+from ..world.shaping import shape_drawn, shape_matt
 from ..world.surface import NOTHING, Ray, corners_of, interaction, kept_hit
 from ..world.tables import World
 from ..world.tracing import add_shadow_ray, visible
@@ -126,15 +126,11 @@ def _unoccluded(world: World, light: int, p: Vec, n: Vec) -> Vec:
     """Irradiance of a light, or of the sky, if nothing stands before it [radiance * sr]."""
     if light == world.lights.kind.shape[0]:
         return irradiance(world.environment, n)
-    return scale(_radiance(world, light, p, n), irradiance_factor(world.lights, light, p, n))
-
-
-@inlined
-def _radiance(world: World, light: int, p: Vec, n: Vec) -> Vec:
-    """Of a light for what is matt, in the mean over it."""
-    lights = world.lights
-    found = scale(row(lights.radiance, light), np.float64(lights.diffuse[light]))
-    return found if lights.even[light] != 0 else mul(found, shape_matt(lights, light, p, n))
+    share = irradiance_factor(world.lights, light, p, n) * world.lights.diffuse[light]
+    brought = scale(row(world.lights.radiance, light), share)
+    if world.lights.even[light] != 0 or share <= 0.0:
+        return brought
+    return mul(brought, shape_matt(world.lights, light, p, n))
 
 
 @inlined
@@ -148,8 +144,9 @@ def _from_point(world: World, light: int, p: Vec, n: Vec, direction: Vec, distan
         return _unoccluded(world, light, p, n)
     area = 4.0 * a * b if lights.kind[light] == LightKind.RECT.value else math.pi * a * a
     facing = max(0.0, -dot(direction, row(lights.axes[light], 2)))
-    share = area * facing * max(0.0, dot(direction, n)) / (distance * distance)
-    return scale(_radiance(world, light, p, n), share)
+    share = area * facing * max(0.0, dot(direction, n)) / (distance * distance) * lights.diffuse[light]
+    brought = scale(row(lights.radiance, light), share)
+    return brought if lights.even[light] != 0 else mul(brought, shape_drawn(lights, light, p, direction, distance))
 
 
 @inlined

@@ -86,6 +86,19 @@ def shape_mirrored(lights: LightTable, which: int, p: Vec, n: Vec, wo: Vec, alph
     return (share[0] * tint[0], share[1] * tint[1], share[2] * tint[2])
 
 
+@inlined
+def shape_drawn(lights: LightTable, which: int, p: Vec, direction: Vec, distance: float) -> Vec:
+    """What is left of the radiance that comes to `p` from one point of a light, as `lights.shadow_ray` draws it."""
+    lamp, shapes = lamp_of(lights, which), lights.shapes
+    share = _leaving(lights, which, lamp, scale(direction, -1.0), 0.0)
+    if shapes.picture[which, 0] < 0:
+        return share
+    off = sub(along(p, direction, distance), lamp.centre)
+    s, t = 0.5 - 0.5 * dot(off, lamp.x) / lamp.a, 0.5 - 0.5 * dot(off, lamp.y) / lamp.b
+    tint = _texel(shapes, which, int(shapes.picture[which, 1]), s, t)
+    return (share[0] * tint[0], share[1] * tint[1], share[2] * tint[2])
+
+
 # --- the grid -------------------------------------------------------------------------------------------------------
 
 
