@@ -193,7 +193,7 @@ def test_the_scenes_hold_something_of_everything() -> None:
 
 @pytest.mark.parametrize("opacity", [0.25, 0.6])
 def test_a_present_share_is_the_same_share_everywhere(opacity: float) -> None:
-    """A card of partial presence before a wall: which camera rays it stops is a function of their bits alone."""
+    """A card of partial presence before a wall: which rays it stops is a function of pixel and sample alone."""
     card = quad("/card", [(-0.9, -0.6, 0), (0.9, -0.6, 0), (0.9, 0.6, 0.1), (-0.9, 0.6, 0.1)], 0)
     wall = quad("/wall", [(-3, -3, -1), (3, -3, -1), (3, 3, -1), (-3, 3, -1)], 1)
     here = material("/card", EMISSIVE=(0.1, 0.6, 0.2), OPACITY=Source((opacity,) * 4), opacity_presence=True)

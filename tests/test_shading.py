@@ -181,6 +181,21 @@ def test_presence_averages_to_its_coverage(coverage: float) -> None:
     assert not planes["mask"].any()
 
 
+@pytest.mark.parametrize("behind", [False, True], ids=["seen", "through glass"])
+def test_samples_of_a_pixel_share_what_is_there_by_chance(behind: bool) -> None:
+    """Of 16 samples that take turns, as many meet a veil as its coverage says, but for two, in every pixel."""
+    coverage = 0.37
+    veil = material("/veil", OPACITY=coverage, EMISSIVE=1.0, DIFFUSE=0.0, opacity_presence=True)
+    wall = quad("/wall", np.array(CARD) * 4 - [0, 0, 1], 1)
+    pane = box("/pane", (3.0, 3.0, 0.05), 2, centre=(0, 0, 1.0))
+    things = [quad("/veil", np.array(CARD) * 2), wall, *([pane] if behind else [])]
+    what = scene(things, [veil, material("/m", DIFFUSE=0.0), glass(Model.TRACED, 1.0)])
+    found = draw(what, 24, 24, samples=16, tolerance=0.03)["beauty"][..., 0]
+    assert np.abs(found - coverage).max() < 2.01 / 16
+    assert found.mean() == pytest.approx(coverage, abs=0.01)
+    assert found.std() < 0.06  # of 16 tosses of a coin it would be .12
+
+
 def test_glass_is_left_out_of_mirrors() -> None:
     """Opaque surfaces reflect the opaque scene only: a mirror shows the room as if the glass were not there."""
     walls, materials = position_room()

@@ -26,7 +26,7 @@ from ..world.offsets import tie
 from ..world.shading import LOBES, Block, gather, load_surface
 from ..world.surface import NOTHING, HitLanes, Ray, hit_in, interaction, keep_hit, kept_hit
 from ..world.tables import World
-from ..world.tracing import intersect_world
+from ..world.tracing import belongs_to, intersect_world
 from .answers import Answers, add_answer, add_glow, new_answers
 from .crossing import (
     LEFT,
@@ -255,6 +255,7 @@ def trace(scratch: TreeScratch, world: World, rules: Rules, taken: int) -> None:
             packet, lane, row(now.origin, lane), row(now.direction, lane), now.start[lane], now.end[lane],
             OPAQUE if blind else EVERYTHING,
         )  # fmt: skip
+        _belongs(scratch, lane)
         together = together and now.met[lane] <= 1 and now.side[lane] == now.side[0]
     intersect_world(packet, world, scratch.far, COHERENT if together else SCATTERED)
     again = False
@@ -280,12 +281,19 @@ def trace(scratch: TreeScratch, world: World, rules: Rules, taken: int) -> None:
         near = tie(along(p, d, hit.t))
         scratch.far[lane] = hit.t + near
         set_ray(packet, lane, p, d, max(0.0, hit.t - near), hit.t + near, OPAQUE)
+        _belongs(scratch, lane)
         again = True
     if again:
         intersect_world(packet, world, scratch.far, SCATTERED)
         for lane in range(taken):
             if has_hit(packet, lane):
                 keep_hit(met, lane, hit_in(packet, lane, world.geometry))
+
+
+@inlined
+def _belongs(scratch: TreeScratch, lane: int) -> None:
+    cell, i = scratch.cell, scratch.now.pixel[lane]
+    belongs_to(scratch.packet, lane, cell.x[i], cell.y[i], cell.sample[i])
 
 
 @inlined

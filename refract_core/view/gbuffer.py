@@ -25,7 +25,7 @@ from ..world.environment import radiance
 from ..world.shading import Block, load_hits, shade
 from ..world.surface import Hit, hit_in
 from ..world.tables import World
-from ..world.tracing import intersect_world
+from ..world.tracing import belongs_to, intersect_world
 from .camera import Tile, View, pixel_ray
 
 
@@ -124,6 +124,7 @@ def opaque_tile(
                 x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
                 if x < width and y < height:
                     far[lane] = add_view_ray(packet, view, lane, x, y, EVERYTHING)
+                    belongs_to(packet, lane, x, y, sample)
                     set_key(block.key, lane, Key(x, y, 0, sample))
             intersect_world(packet, world, far, COHERENT)
             behind = False
@@ -137,7 +138,7 @@ def opaque_tile(
                     behind = True
                     glass += 1
             if behind:
-                trace_behind_glass(scratch, world, view, x0, y0)
+                trace_behind_glass(scratch, world, view, x0, y0, sample)
             load_hits(block, packet, world, view.spread)
             shade(block, scratch.second, packet, world, OPAQUE)
             write_opaque(layer, block, world, view, x0, y0)
@@ -145,7 +146,7 @@ def opaque_tile(
 
 
 @inlined
-def trace_behind_glass(scratch: ViewScratch, world: World, view: View, x0: int, y0: int) -> None:
+def trace_behind_glass(scratch: ViewScratch, world: World, view: View, x0: int, y0: int, sample: int) -> None:
     """Trace again, glass left out, the lanes that met glass first; the others keep the hits they have."""
     packet = scratch.packet
     for lane in range(LANES):
@@ -155,6 +156,7 @@ def trace_behind_glass(scratch: ViewScratch, world: World, view: View, x0: int, 
         if again:
             x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
             scratch.far[lane] = add_view_ray(packet, view, lane, x, y, OPAQUE)
+            belongs_to(packet, lane, x, y, sample)
     intersect_world(packet, world, scratch.far, COHERENT)
     for lane in range(LANES):
         packet.valid[lane] = scratch.asked[lane]

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..kernels.arrays import F64_1D, F64_2D, I32_1D, I32_2D
-from ..kernels.compile import inlined, kernel
+from ..kernels.compile import inlined, kernel, word
 from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Vectors, new_lanes, put
 from ..kernels.sampling import Key, set_key
 from ..kernels.vec import Vec, add, dot, length, lerp, mul, row, scale, sub
@@ -41,7 +41,7 @@ from ..world.shading import (
 )
 from ..world.surface import hit_in
 from ..world.tables import World
-from ..world.tracing import intersect_world, lamp_visible, visible
+from ..world.tracing import belongs_to, intersect_world, lamp_visible, visible
 from .camera import Tile, View
 from .gbuffer import OpaqueLayer, ViewScratch, add_view_ray, is_refractive, keep_hits, trace_behind_glass, write_opaque
 
@@ -59,6 +59,8 @@ _STEP_OF_LAMP = 0.05
 """Share of a lamp's light by which neighbours differ that do not see the same of it. Shadows of glass are no steps."""
 _FLAT = 0.1
 """Part of their distance by which places may lie outside of each other's plane."""
+_FIRST = word(0)
+"""The sample that corners are."""
 _NET = 1 << 16
 """Branch of the sequences of nets."""
 
@@ -162,6 +164,7 @@ def _look(
                 wanted = x0 - _MARGIN <= x <= x1 + _MARGIN and y0 - _MARGIN <= y <= y1 + _MARGIN
                 if wanted and 0 <= x < width and 0 <= y < height:
                     far[lane] = add_view_ray(packet, view, lane, x, y, EVERYTHING)
+                    belongs_to(packet, lane, x, y, _FIRST)
             intersect_world(packet, world, far, COHERENT)
             behind = False
             for lane in range(LANES):
@@ -174,7 +177,7 @@ def _look(
                     layer.glass[y, x] = 1 if refractive else 0
                     glass += 1 if refractive else 0
             if behind:
-                trace_behind_glass(looking, world, view, bx, by)
+                trace_behind_glass(looking, world, view, bx, by, _FIRST)
             if x0 <= bx and y0 <= by:
                 keep_hits(layer.hits, packet, world, bx, by, x1, y1)
             load_hits(block, packet, world, view.spread)

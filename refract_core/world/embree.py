@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..errors import EmbreeError, SceneError
 from ..kernels.arrays import F32_2D, I32_1D, I32_2D, I64_1D
 from ..kernels.compile import External, flag, inlined, word
-from ..kernels.lanes import LANES, Flags, Scalars
+from ..kernels.lanes import LANES, Flags, Scalars, Words
 from ..kernels.vec import Vec
 
 # Ray masks: what a ray may see. A geometry carries one of the first five, and one of the rest per captured set.
@@ -212,6 +212,10 @@ class Packet(NamedTuple):
     """`valid` as the caller of `tracing.intersect_world` set it, while it looks behind cut-outs"""
     chance: Flags
     """1 where the ray of a lane met a surface that is there by chance, or not (`tracing.intersect_world`)"""
+    pixel: Words
+    """bits that stand for the pixel a ray belongs to"""
+    turn: Scalars
+    """of its sample, 0 .. 1: what `tracing` tosses for surfaces that are there by chance; -1 where it is on its own"""
     shadowed: Flags
     """`valid` as the caller of `tracing.visible` set it, while it looks behind cut-outs and through glass"""
     ends: Scalars
@@ -236,6 +240,8 @@ class Packet(NamedTuple):
             tally=np.zeros(1, np.int64),
             asked=np.zeros(LANES, np.int32),
             chance=np.zeros(LANES, np.int32),
+            pixel=np.zeros(LANES, np.int32),
+            turn=np.full(LANES, -1.0),
             shadowed=np.zeros(LANES, np.int32),
             ends=np.zeros(LANES),
             begun=np.zeros(LANES),
@@ -263,6 +269,7 @@ def set_ray(packet: Packet, lane: int, origin: Vec, direction: Vec, t_near: floa
     rays[T_FAR, lane] = t_far
     words[MASK, lane] = mask
     words[GEOM, lane] = _INVALID
+    packet.turn[lane] = -1.0
     packet.valid[lane] = -1
 
 

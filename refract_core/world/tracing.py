@@ -6,7 +6,7 @@ import numpy as np
 
 from ..kernels.compile import inlined
 from ..kernels.lanes import LANES, Scalars, Vectors, put
-from ..kernels.sampling import chance_of_bits
+from ..kernels.sampling import chance_of_bits, hash32
 from ..kernels.vec import Vec, dot, mul, row, scale
 from ..optics.interface import fresnel_dielectric, transmittance
 from ..optics.models import (
@@ -48,6 +48,7 @@ from .tables import World
 
 _MAX_CUTOUTS = 64
 """Holes that one ray may go through; behind so many it meets whatever comes next."""
+_GOLDEN = 0.6180339887498949
 _MAX_WALLS = 64
 """Walls of glass that light is looked at through; behind so many it goes on unchanged."""
 
@@ -70,11 +71,21 @@ def _absent(world: World, packet: Packet, lane: int) -> bool:
     threshold = world.materials.threshold[m]
     if threshold > 0.0:
         return opacity < threshold
-    # Coverage as chance: decided by the bits of the ray itself, so it is the same wherever the ray is traced.
+    # Coverage as chance. The samples of a pixel take turns, so that together they see as much as is there; a ray that
+    # belongs to none goes by its own bits, so that it is the same wherever it is traced.
+    if packet.turn[lane] >= 0.0:
+        return opacity <= (chance_of_bits(packet.pixel[lane], hit.part, 0) + packet.turn[lane]) % 1.0
     words = packet.words
     return opacity <= chance_of_bits(
         words[DIR_X, lane] ^ words[ORG_X, lane], words[DIR_Y, lane], words[DIR_Z, lane] ^ hit.part
     )
+
+
+@inlined
+def belongs_to(packet: Packet, lane: int, x: int, y: int, sample: int) -> None:
+    """Say whose the ray in a lane is: one of a pixel's samples, which take turns a golden section apart."""
+    packet.pixel[lane] = np.int32(hash32(x, y, 0))
+    packet.turn[lane] = sample * _GOLDEN % 1.0
 
 
 @inlined

@@ -13,7 +13,7 @@ from refract_core.settings import RenderSettings
 from . import sampling
 from .media import Media, media_around
 from .screen import Found, by_proxy
-from .shading import Shader, View, ray_bits
+from .shading import Shader, View
 from .tiers import Leaf
 from .tree import End, Grown, Ray, Tree
 from .vec import ZERO, Vec, add, at, dot, scaled, sub, unit, vec
@@ -118,13 +118,12 @@ class Oracle:
     def _through(self, x: int, y: int, k: int, nudge: tuple[float, float] = (0.0, 0.0)) -> tuple[Sight, View]:
         jx, jy = self.jitters[k]
         px, py = x + 0.5 + jx, y + 0.5 + jy
-        straight = self.ray(px, py)
-        view = View((x, y, 0), k, ray_bits(straight.origin, straight.direction))
+        view = View((x, y, 0), k, (x, y, k))
         return self.ray(px + nudge[0], py + nudge[1]), view
 
     def _first_opaque(self, sight: Sight, view: View) -> Hit | None:
         hits = self.shader.world.candidates(sight.origin, sight.direction, sight.near, sight.far, OPAQUE)
-        return first(hits, lambda h: self.shader.present(h, sight.origin, sight.direction, view.bits))
+        return first(hits, lambda h: self.shader.present(h, sight.origin, sight.direction, view.turn))
 
     def _backdrop(self, sight: Sight, view: View, hit: Hit | None) -> tuple[Vec, float]:
         """Colour and alpha of what stands behind all glass."""

@@ -24,8 +24,8 @@ class View(NamedTuple):
 
     key: Key
     sample: int
-    bits: tuple[int, int, int]
-    """words of the camera's ray, which decide the chance of a partly present surface on it"""
+    turn: tuple[int, int, int]
+    """pixel and sample, which decide whether a partly present surface is there"""
 
 
 class Gathered(NamedTuple):
@@ -57,18 +57,22 @@ class Shader:
         """First present surface of a ray that starts on one."""
         return first(self.world.candidates(o, d, NEAR, far, kinds), lambda hit: self.present(hit, o, d, None))
 
-    def present(self, hit: Hit, o: Vec, d: Vec, bits: tuple[int, int, int] | None) -> bool:
+    def present(self, hit: Hit, o: Vec, d: Vec, turn: tuple[int, int, int] | None) -> bool:
         """A cut-out surface is there where its opacity reaches the threshold; with `presence`, as often as its
-        opacity says. `bits`: of the camera's ray, known exactly; other rays are rounded on their way."""
+        opacity says. `turn`: of the pixel's own rays and what they become, whose samples are a golden section apart;
+        all others go by their bits, which are rounded on their way."""
         m = self.world.material(hit)
         if not m.cutout:
             return True
         opacity = number(self.scene, hit._replace(width=0.0), m, Param.OPACITY)
         if m.opacity_threshold > 0.0:
             return opacity >= m.opacity_threshold
-        if bits is None:
-            self.unsure = self.unsure or 0.0 < opacity < 1.0
-            bits = ray_bits(o, d)
+        if turn is not None:
+            x, y, k = turn
+            first_turn = sampling.hashed(sampling.hashed(x, y, 0), hit.face.part, 0) / 2**32
+            return opacity > (first_turn + k * (math.sqrt(5.0) - 1.0) / 2.0) % 1.0
+        self.unsure = self.unsure or 0.0 < opacity < 1.0
+        bits = ray_bits(o, d)
         return opacity > sampling.hashed(bits[0], bits[1], bits[2] ^ hit.face.part) / 2**32
 
     def _arrives(self, surface: Surface, d: Vec, distance: float, casters: tuple[str, ...] | None = None) -> Vec:

@@ -238,8 +238,7 @@ class Tree:
         return [hit._replace(width=self.spread * (ray.travelled + hit.t)) for hit in hits]
 
     def _present(self, ray: Ray, view: View) -> Callable[[Hit], bool]:
-        bits = view.bits if ray.side is Side.VIEW else None
-        return lambda hit: self.shader.present(hit, ray.origin, ray.direction, bits)
+        return lambda hit: self.shader.present(hit, ray.origin, ray.direction, view.turn)
 
     def _choice(self, ray: Ray, hit: Hit) -> Choice:
         """Rules 3 to 7."""
