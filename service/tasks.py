@@ -30,6 +30,9 @@ _QUOTES = (
     r"\S*pxrInternal.*"
 )
 """Where USD's messages begin to quote files, or its own source."""
+_PARSED = re.compile(r":(?P<line>\d{1,9}):(?P<column>\d{1,9}): (?:Expected (?P<wanted>[!-~]{1,20}) at ')?")
+"""Where USD's parser stopped, and what it waited for: words of its grammar, before those of the file."""
+_CUT_OFF = "the package has no directory at its end, so it was cut off"
 _UNITS = ("Z", "thickness", "path_length", "layers")
 """Planes that are not between 0 and 1: their PNG is scaled, and says by how much."""
 _SETTINGS = ("camera", "image_width", "image_height", "quality", "preset", "samples", "tolerance", "light_samples",
@@ -66,16 +69,30 @@ def perform(kind: str, stage: str, out: str, settings: Mapping[str, Any], limits
 
 
 def _public(text: str) -> str:
-    """A message without USD's own words, which quote files, and without paths of this machine."""
-    text = text.split(" cannot be read as ")[0] + " cannot be read as USD" if " cannot be read as " in text else text
+    """A message without USD's own words, which quote files, and without paths of this machine; with the place that
+    USD's words are about."""
+    place = _place_of(text)
+    name, unreadable, why = text.partition(" cannot be read as ")
+    if unreadable:
+        ours = f": {_CUT_OFF}" if _CUT_OFF in why else ""
+        text = f"{name} cannot be read as USD{ours}"
     if text.startswith("USD says:"):
-        return "USD warned about this stage; `refract render` on it shows what it said"
-    text = re.sub(_QUOTES, "", text).strip()
+        return f"USD warned about this stage{place}; `refract render` on it shows what it said"
+    text = re.sub(_QUOTES, "", text).strip() + place
     for folder in sorted({os.getcwd(), os.path.realpath("."), os.path.dirname(os.getcwd())}, key=len, reverse=True):
         text = text.replace(folder + os.sep, "")
     for known in (os.path.expanduser("~"), os.path.dirname(os.path.dirname(refract_core.__file__))):
         text = text.replace(known, "")
     return text[:500]
+
+
+def _place_of(text: str) -> str:
+    """`: line 7, column 5: expected }` of a message in which USD quotes a layer it cannot parse; else ''."""
+    found = _PARSED.search(text)
+    if not found:
+        return ""
+    wanted = f": expected {found['wanted']}" if found["wanted"] else ""
+    return f": line {found['line']}, column {found['column']}{wanted}"
 
 
 def _tell(notices: tuple[Notice, ...] | list[Notice], say: Say, limits: Mapping[str, int]) -> None:
@@ -117,8 +134,8 @@ def _render(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[s
     aovs = settings.get("aovs") or []
     extension = settings["format"]
     frame = replace(frame, metadata={**frame.metadata, **override_notes(overrides)})
-    frame.save(os.path.join(out, f"image.{extension}"), aovs=aovs if extension == "exr" else (),
-               color_correction=correction)  # fmt: skip
+    held = tuple(dict.fromkeys(("beauty", *aovs))) if aovs and extension == "exr" else ()
+    frame.save(os.path.join(out, f"image.{extension}"), aovs=held, color_correction=correction)
     kept = []
     for name in aovs:
         if name == "P":  # no picture holds positions

@@ -164,7 +164,8 @@ def _rgba(pixels: NDArray[Any], spec: Any) -> NDArray[Any]:
     if count == 4 and alpha == 3:
         return np.ascontiguousarray(pixels)
     out = np.empty((*pixels.shape[:2], 4), pixels.dtype)
-    out[..., :3] = pixels[..., rgb]
+    for channel, column in enumerate(rgb):  # one by one: all three at once would be a copy of a large picture
+        out[..., channel] = pixels[..., column]
     out[..., 3] = pixels[..., alpha] if alpha >= 0 else opaque
     return out
 

@@ -60,7 +60,8 @@ def read_texture(source: str | bytes, *, name: str, color_space: str) -> Texture
         srgb = color_space == "sRGB" or (color_space == "auto" and channels >= 3)
         return Texture(name, pixels, srgb)
     if integer and color_space == "sRGB":
-        pixels[..., :3] = srgb_decode(pixels[..., :3])
+        for row in pixels:  # row by row: of the whole picture, each step of the formula would be one more copy
+            row[:, :3] = srgb_decode(row[:, :3])
     return Texture(name, pixels)
 
 
