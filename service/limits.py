@@ -29,6 +29,8 @@ class Limits:
     header_seconds: int = _limit(10, "s", "time for a request's head to arrive")
     settings_bytes: int = _limit(256 << 10, "bytes", "settings of one request, as JSON")
     stage_bytes: int = _limit(64 << 20, "bytes", "one uploaded stage, and what its package holds when unpacked")
+    upload_files: int = _limit(1000, "files", "files of one upload")
+    upload_ratio: int = _limit(200, "times", "bytes of an unpacked archive to its own")
     layers: int = _limit(256, "files", "layers that one stage is composed of")
     pixels: int = _limit(1 << 22, "pixels", "width times height of a picture")
     samples: int = _limit(64, "per pixel", "samples of a pixel")

@@ -42,7 +42,10 @@ class Override(Strict):
 class StageOnly(Strict):
     """`POST /v1/inspect`, `/v1/validate`."""
 
-    stage: Path | None = Field(None, description="a stage of GET /v1/stages; leave it out when a file is uploaded")
+    stage: Path | None = Field(None, description=(
+        "a stage of GET /v1/stages; of an upload of several files, the one to open; leave it out when one file is "
+        "uploaded"
+    ))  # fmt: skip
 
 
 class Render(StageOnly):

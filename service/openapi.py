@@ -110,10 +110,21 @@ def _body(model: type[models.StageOnly]) -> dict[str, Any]:
     ours = {**schema, "required": ["stage"], "properties": {
         "stage": {**named, "title": "Stage", "description": "a stage of GET /v1/stages"}, **schema["properties"],
     }}  # fmt: skip
-    settings = {"type": "string", "contentMediaType": "application/json", "contentSchema": schema}
+    told = {**schema, "properties": {
+        "stage": {**named, "title": "Stage", "description": "of an upload of several files, the one to open"},
+        **schema["properties"],
+    }}  # fmt: skip
+    settings = {"type": "string", "contentMediaType": "application/json", "contentSchema": told}
+    one = {"type": "string", "format": "binary"}
     form = {
-        "type": "object", "required": ["stage"], "additionalProperties": False,
-        "properties": {"stage": {"type": "string", "format": "binary"}, "settings": settings},
+        "type": "object", "additionalProperties": False, "anyOf": [{"required": ["stage"]}, {"required": ["file"]}],
+        "properties": {
+            "stage": {**one, "description": "USD, glTF, or a .zip with a stage and all that belongs to it"},
+            "file": {"type": "array", "items": one, "minItems": 1, "description": (
+                "a file that the stage refers to, under its relative name; of several, one may be the stage"
+            )},
+            "settings": settings,
+        },
     }  # fmt: skip
     content = {"application/json": {"schema": ours}, "multipart/form-data": {"schema": form}}
     return {"required": True, "content": content}

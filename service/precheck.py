@@ -17,6 +17,9 @@ from pxr import Ar, Sdf, Tf, UsdUtils
 
 from refract_core.usd.diagnostics import captured
 
+from .gltf_parts import parts_of
+from .uploads import GLTF
+
 _LAYERS = (".usd", ".usda", ".usdc", ".usdz")
 
 
@@ -75,6 +78,8 @@ def _names(place: Place) -> list[tuple[str, bool]]:
     """What a layer refers to, and whether as another layer. A layer that cannot be read refers to nothing."""
     if not place.inner and not os.path.isfile(place.file):
         return []
+    if not place.inner and place.file.lower().endswith(GLTF):
+        return [(name, False) for name in parts_of(place.file)]
     if not (place.inner or place.file).lower().endswith(_LAYERS):
         return []
     with captured():

@@ -110,6 +110,8 @@ async def _submit(request: Request, kind: str, extra: dict[str, Any], jobs: Jobs
     wish = await read_wish(request, models.KINDS[kind], jobs.limits, jobs.store.work)
     try:
         settings = {**wish.settings.model_dump(exclude_none=True, exclude={"stage"}), **extra}
+        if wish.inner:
+            settings["stage"] = wish.inner
         _check_limits(settings, jobs)
         if wish.upload:
             digest, stage = await asyncio.to_thread(file_digest, wish.upload), f"stage{wish.suffix}"

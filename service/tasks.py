@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from typing import Any
@@ -20,6 +21,7 @@ from refract_core.images.aovs import AOVS
 from refract_core.scene import Notice, Scene
 from refract_core.verbs.override import OverrideError, Overrides, override, override_notes
 
+from . import uploads
 from .problems import Problem
 
 Say = Callable[..., None]
@@ -39,6 +41,23 @@ _SETTINGS = ("camera", "image_width", "image_height", "quality", "preset", "samp
              "cut", "tiers", "screen", "model", "max_layers", "exposure", "camera_light", "purposes")  # fmt: skip
 
 
+def laid_out(stage: str, root: str, settings: Mapping[str, Any], limits: Mapping[str, int]) -> tuple[str, str]:
+    """An upload of several files as a folder, which becomes the current one. Anything else stays as it is.
+
+    Returns:
+        The stage, relative to the current folder, and that folder.
+
+    Raises:
+        Problem: a file is refused, or none of them is the stage.
+    """
+    if not stage.endswith(uploads.ARCHIVE):
+        return stage, root
+    folder = os.path.realpath(tempfile.mkdtemp(prefix="upload-"))
+    chosen = uploads.stage_among(uploads.unpack(stage, folder, limits), settings.get("stage") or "")
+    os.chdir(folder)
+    return chosen, folder
+
+
 def perform(kind: str, stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[str, int], say: Say) -> Any:
     """Do one job. `stage` is relative to the current folder. Returns what the job's record keeps of it.
 
@@ -49,6 +68,8 @@ def perform(kind: str, stage: str, out: str, settings: Mapping[str, Any], limits
 
     codec.MAX_TEXTURE_PIXELS = min(codec.MAX_TEXTURE_PIXELS, limits["texture_pixels"])
     try:
+        if kind != "convert" and stage.lower().endswith(uploads.GLTF):
+            stage = _as_usd(stage, say, limits)
         return _VERBS[kind](stage, out, settings, limits, say)
     except StageError as error:
         raise Problem("stage-invalid", _public(str(error))) from None
@@ -56,6 +77,9 @@ def perform(kind: str, stage: str, out: str, settings: Mapping[str, Any], limits
         if str(error).startswith("camera ") and settings.get("camera"):
             raise Problem("invalid-settings", _public(str(error)),
                           errors=[{"pointer": "/camera", "detail": "the stage has no such camera"}]) from None
+        if "needs the extra" in str(error):
+            text = "glTF is not read here: the extra `gltf` is not installed"
+            raise Problem("unsupported-media-type", text) from None
         raise Problem("invalid-settings", _public(str(error))) from None
     except (SceneError, ImageError) as error:
         raise Problem("stage-invalid", _public(str(error))) from None
@@ -66,6 +90,19 @@ def perform(kind: str, stage: str, out: str, settings: Mapping[str, Any], limits
         raise Problem("memory-limit", "the job ran out of memory") from error
     except RefractError as error:
         raise Problem("stage-invalid", _public(str(error))) from None
+
+
+def _as_usd(stage: str, say: Say, limits: Mapping[str, int]) -> str:
+    """A glTF file as USD with its glass described, as `refract convert` makes it, in a folder that becomes the current
+    one."""
+    from refract_core.verbs.convert import ConvertOrder, convert
+
+    say(progress=0.0, stage="reading glTF")
+    folder, name = tempfile.mkdtemp(prefix="gltf-"), f"{os.path.splitext(os.path.basename(stage))[0]}.usdz"
+    done = convert(ConvertOrder(stage=stage, out=os.path.join(folder, name)))
+    _tell(done.notices, say, limits)
+    os.chdir(folder)
+    return name
 
 
 def _public(text: str) -> str:

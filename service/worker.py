@@ -180,13 +180,14 @@ def _perform(job: dict[str, Any], say: Any) -> Any:
     confine.confine([*own_files(), root], [out, scratch], means)
     if job.get("forbidden"):  # for tests: prove that the lock holds
         return _try_to_escape(job["forbidden"])
+    stage, root = tasks.laid_out(job["stage"], root, job["settings"], limits)
     try:
-        precheck.check_stage(job["stage"], root, layers=limits["layers"], unpacked_bytes=limits["stage_bytes"])
+        precheck.check_stage(stage, root, layers=limits["layers"], unpacked_bytes=limits["stage_bytes"])
     except precheck.TooMany as error:
         raise Problem("limit-exceeded", str(error)) from None
     except precheck.Refused as error:
         raise Problem("stage-refused", str(error)) from None
-    return tasks.perform(job["kind"], job["stage"], out, job["settings"], limits, say)
+    return tasks.perform(job["kind"], stage, out, job["settings"], limits, say)
 
 
 def own_files() -> list[str]:

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import json
+import stat
+import struct
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,7 +19,8 @@ from service_server import BALL, PATIENT, ROOT, SMALL, Server, running, upload
 from service_stages import HEAD, package, referring
 
 from refract_core.images.codec import encoded, exr_spec
-from refract_core.images.pictures import read_planes
+from refract_core.images.pictures import read_planes, read_texture
+from refract_core.verbs.convert import ConvertOrder, convert
 from service.limits import Limits
 
 pytestmark = pytest.mark.slow
@@ -42,6 +48,11 @@ def render(client: httpx.Client, files: Any, accept: str = "image/png", **settin
 def warnings(client: httpx.Client, answer: httpx.Response) -> list[str]:
     assert answer.status_code == 200, answer.text
     return [one["text"] for one in client.get(answer.headers["content-location"]).json()["warnings"]]
+
+
+def pixels(answer: httpx.Response) -> Any:
+    assert answer.status_code == 200, answer.text
+    return read_texture(answer.content, name="picture", color_space="raw").pixels
 
 
 # --- errors of syntax
@@ -127,3 +138,126 @@ def test_an_exr_with_planes_holds_the_picture_too(client: httpx.Client, tmp_path
     planes = read_planes(str(tmp_path / "planes.exr"))
     assert planes.keys() == {"beauty", "N", "thickness"}
     np.testing.assert_array_equal(planes["beauty"], read_planes(str(tmp_path / "plain.exr"))["beauty"])
+
+
+# --- stages of several files
+
+
+def tree() -> dict[str, bytes]:
+    """A stage one folder down, a layer beside it, a picture beside that folder; every reference stays inside."""
+    wall = textured("../textures/wall.png")
+    shot = referring("../parts/wall.usda")
+    return {"shots/shot.usda": shot.encode(), "parts/wall.usda": wall.encode(),
+            "textures/wall.png": (GOOD / "textures" / "wood.png").read_bytes()}  # fmt: skip
+
+
+def whole(client: httpx.Client, answer: httpx.Response) -> bytes:
+    """The picture, if nothing was missing."""
+    assert not [text for text in warnings(client, answer) if "wall" in text or "missing" in text]
+    return answer.content
+
+
+def test_several_files_are_one_stage(client: httpx.Client) -> None:
+    files = tree()
+    parts = [("file", (name, content)) for name, content in files.items() if name != "shots/shot.usda"]
+    first = render(client, [("stage", ("shots/shot.usda", files["shots/shot.usda"])), *parts])
+    picture = whole(client, first)
+    every = [("file", (name, content)) for name, content in reversed(files.items())]
+    named = render(client, every, stage="shots/shot.usda")
+    assert whole(client, named) == picture
+    assert named.headers["etag"] == first.headers["etag"]  # the same files, whatever their order
+    ambiguous = render(client, every).json()  # a stage in each of two folders
+    assert "parts/wall.usda, shots/shot.usda" in ambiguous["detail"]
+    alone = render(client, [("stage", ("shots/shot.usda", files["shots/shot.usda"]))])
+    assert alone.json()["type"] == "/problems/stage-refused"  # one file has no place beside it
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+def test_a_zip_is_one_stage(client: httpx.Client, method: int) -> None:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", method) as archive:
+        for name, content in tree().items():
+            archive.writestr(f"scene/{name}", content)
+    files = {"stage": ("scene.zip", stream.getvalue())}
+    picture = whole(client, render(client, files, stage="scene/shots/shot.usda"))
+    parts = [("file", (name, content)) for name, content in tree().items()]
+    assert whole(client, render(client, parts, stage="shots/shot.usda")) == picture
+    for verb in ("inspect", "validate", "convert"):
+        settings = json.dumps({"stage": "scene/shots/shot.usda"})
+        answer = client.post(f"/v1/{verb}", files=files, data={"settings": settings})
+        assert answer.status_code == 200, answer.text
+    inside = zipfile.ZipFile(io.BytesIO(answer.content)).namelist()
+    assert any(name.endswith(".png") for name in inside)  # the converted package is whole
+
+
+@pytest.mark.parametrize("reference", ["../../../x.usda", "/etc/passwd", "../x.usda"])
+def test_nothing_leaves_the_folder_of_an_upload(client: httpx.Client, reference: str) -> None:
+    parts = [("file", ("a.usda", referring(reference).encode())), ("file", ("b/c.usda", BALL.encode()))]
+    refused = render(client, parts, stage="a.usda")
+    assert refused.json()["type"] == "/problems/stage-refused"
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        link = zipfile.ZipInfo("x.usda")
+        link.external_attr, link.create_system = (stat.S_IFLNK | 0o777) << 16, 3
+        archive.writestr("a.usda", referring("./x.usda"))
+        archive.writestr(link, "/etc/passwd")
+    linked = render(client, {"stage": ("a.zip", stream.getvalue())})
+    assert linked.json()["type"] == "/problems/stage-refused"
+    assert "x.usda" in linked.json()["detail"]
+
+
+# --- glTF
+
+
+def test_gltf_is_converted_and_drawn(client: httpx.Client, tmp_path: Path) -> None:
+    document, content = ball_of_glass()
+    (tmp_path / "ball.gltf").write_text(json.dumps(document))
+    (tmp_path / "ball points.bin").write_bytes(content)
+    convert(ConvertOrder(stage=str(tmp_path / "ball.gltf"), out=str(tmp_path / "ball.usdz")))
+    expected = render(client, upload((tmp_path / "ball.usdz").read_bytes()))
+    parts = [("stage", ("ball.gltf", json.dumps(document).encode())), ("file", ("ball points.bin", content))]
+    drawn = render(client, parts)
+    assert drawn.status_code == 200, drawn.text
+    np.testing.assert_array_equal(pixels(drawn), pixels(expected))
+    single = json.loads(json.dumps(document))
+    single["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(content).decode()
+    np.testing.assert_array_equal(pixels(render(client, upload(json.dumps(single), "ball.gltf"))), pixels(expected))
+    del single["buffers"][0]["uri"]
+    glb = {"stage": ("ball.glb", binary(single, content))}
+    np.testing.assert_array_equal(pixels(render(client, glb)), pixels(expected))
+    assert client.post("/v1/inspect", files=glb).json()["prims"]["meshes"] == 1
+    report = client.post("/v1/convert", files=glb, headers={"Accept": "application/json"}).json()
+    assert [row["shader"] for row in report["materials"]] == ["KHR_materials_transmission"]
+    broken = render(client, {"stage": ("a.glb", b"glTF" + bytes(40))})
+    assert broken.json()["type"] == "/problems/stage-invalid"
+    gone = render(client, upload(json.dumps(document), "ball.gltf"))
+    assert "ball%20points.bin" in gone.json()["detail"]
+
+
+def ball_of_glass() -> tuple[dict[str, Any], bytes]:
+    """An octahedron of glass as glTF, and its buffer."""
+    points = np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)], np.float32)
+    corners = np.array([(0, 2, 4), (2, 1, 4), (1, 3, 4), (3, 0, 4), (2, 0, 5), (1, 2, 5), (3, 1, 5), (0, 3, 5)], "u2")
+    content = points.tobytes() + corners.tobytes()
+    accessors = [
+        {"bufferView": 0, "componentType": 5126, "count": 6, "type": "VEC3", "min": [-1] * 3, "max": [1] * 3},
+        {"bufferView": 1, "componentType": 5123, "count": 24, "type": "SCALAR"},
+    ]
+    views = [{"buffer": 0, "byteOffset": 0, "byteLength": points.nbytes},
+             {"buffer": 0, "byteOffset": points.nbytes, "byteLength": corners.nbytes}]  # fmt: skip
+    document = {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "material": 0}]}],
+        "materials": [{"extensions": {"KHR_materials_transmission": {"transmissionFactor": 1.0}}}],
+        "extensionsUsed": ["KHR_materials_transmission"], "accessors": accessors, "bufferViews": views,
+        "buffers": [{"uri": "ball%20points.bin", "byteLength": len(content)}],
+    }  # fmt: skip
+    return document, content
+
+
+def binary(document: dict[str, Any], content: bytes) -> bytes:
+    """The same as one .glb."""
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(content), 0x004E4942) + content
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
