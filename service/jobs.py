@@ -36,6 +36,13 @@ class _Plane(BaseModel):
     white: float
 
 
+class _Picture(BaseModel):
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+    width: int
+    height: int
+    time_code: float
+
+
 class _Done(BaseModel):
     """What a worker may say at its end. It has read a stranger's file, so it is not believed blindly."""
 
@@ -43,6 +50,7 @@ class _Done(BaseModel):
     width: int | None = None
     height: int | None = None
     aovs: list[_Plane] = []
+    pictures: list[_Picture] = []
 
 
 class Jobs:

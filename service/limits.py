@@ -35,6 +35,7 @@ class Limits:
     pixels: int = _limit(1 << 22, "pixels", "width times height of a picture")
     samples: int = _limit(64, "per pixel", "samples of a pixel")
     pixel_samples: int = _limit(1 << 27, "samples", "width times height times samples")
+    pictures: int = _limit(64, "pictures", "pictures of one job, sizes times time codes")
     aovs: int = _limit(16, "planes", "AOVs of one request")
     triangles: int = _limit(20_000_000, "triangles", "triangles of a stage, instances counted")
     texture_pixels: int = _limit(1 << 26, "pixels", "one texture")

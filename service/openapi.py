@@ -40,6 +40,7 @@ _RESULT_HEADERS = {
 }
 _PATHS: dict[str, Any] = {
     "identifier": {"type": "string", "pattern": "^[0-9a-f]{64}$"},
+    "number": {"type": "integer", "minimum": 0, "maximum": 9999},
     "name": {"type": "string", "enum": [name for name in get_args(models.Aov) if name != "P"]},
 }
 """What a part of a path may be; anything else is a 404."""

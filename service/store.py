@@ -17,7 +17,10 @@ from typing import Any
 from .problems import Problem
 
 ENDED = ("done", "failed", "cancelled")
-RESULTS = re.compile(r"^(image\.(png|exr)|aov\.[A-Za-z_.]+\.png|report\.json|converted\.usdz)$")
+RESULTS = re.compile(
+    r"^((image|picture\.\d{1,4})\.(png|jpg|webp|avif|exr)|pictures\.zip|aov\.[A-Za-z_.]+\.png|report\.json|"
+    r"converted\.usdz)$"
+)
 _ID = re.compile(r"^[0-9a-f]{64}$")
 
 
@@ -57,11 +60,15 @@ class Record:
             links |= {"render": {"image": f"{here}/image"}, "convert": {"file": f"{here}/file",
                       "report": f"{here}/report"}}.get(self.kind, {"report": f"{here}/report"})  # fmt: skip
         aovs = [{**aov, "href": f"{here}/aovs/{aov['name']}.png"} for aov in self.result.get("aovs", [])]
+        several = self.result.get("pictures", [])
+        pictures = [{**one, "href": f"{here}/pictures/{number}"} for number, one in enumerate(several)]
+        if pictures and self.status == "done":
+            links["pictures"] = f"{here}/pictures"
         kept = ("id", "kind", "status", "fraction", "stage_of_work", "created", "started", "finished", "warnings",
                 "problem")  # fmt: skip
         return {
             **{name: getattr(self, name) for name in kept}, "width": self.result.get("width"),
-            "height": self.result.get("height"), "aovs": aovs, "links": links,
+            "height": self.result.get("height"), "aovs": aovs, "pictures": pictures, "links": links,
         }  # fmt: skip
 
 

@@ -5,6 +5,7 @@ Texts that leave are made for strangers: no path of this machine, and no line of
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -18,10 +19,11 @@ import numpy as np
 import refract_core
 from refract_core.errors import EmbreeError, ImageError, RefractError, SceneError, StageError, UsageError
 from refract_core.images.aovs import AOVS
+from refract_core.images.frame import Frame
 from refract_core.scene import Notice, Scene
 from refract_core.verbs.override import OverrideError, Overrides, override, override_notes
 
-from . import uploads
+from . import formats, uploads
 from .problems import Problem
 
 Say = Callable[..., None]
@@ -77,6 +79,9 @@ def perform(kind: str, stage: str, out: str, settings: Mapping[str, Any], limits
         if str(error).startswith("camera ") and settings.get("camera"):
             raise Problem("invalid-settings", _public(str(error)),
                           errors=[{"pointer": "/camera", "detail": "the stage has no such camera"}]) from None
+        if str(error).startswith("variant "):
+            raise Problem("invalid-settings", _public(str(error)),
+                          errors=[{"pointer": "/variants", "detail": "the stage has no such variant"}]) from None
         if "needs the extra" in str(error):
             text = "glTF is not read here: the extra `gltf` is not installed"
             raise Problem("unsupported-media-type", text) from None
@@ -144,50 +149,90 @@ def _tell(notices: tuple[Notice, ...] | list[Notice], say: Say, limits: Mapping[
 def _render(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[str, int], say: Say) -> Any:
     from refract_core.rendering.picture import render
     from refract_core.rendering.ready import choose_camera
+    from refract_core.rendering.session import Session
     from refract_core.usd.settings import read_settings
-    from refract_core.usd.stage import open_stage, scene_from_stage
+    from refract_core.usd.stage import open_stage, scene_from_stage, select_variants
     from refract_core.verbs.render_files import chosen_settings
     from refract_core.view.camera import image_size
 
     say(progress=0.0, stage="reading the stage")
     opened = open_stage(stage)
-    found: list[Notice] = []
-    authored = read_settings(opened, "", found)
+    select_variants(opened, settings.get("variants") or ())
+    told: list[Notice] = []
+    authored = read_settings(opened, "", told)
     asked = {name: settings[name] for name in _SETTINGS if settings.get(name) is not None}
     said = {name: tuple(value) if isinstance(value, list) else value for name, value in asked.items()}
     wanted = chosen_settings(authored, {**said, "jobs": settings["threads"]})
-    scene = scene_from_stage(
-        opened, time_code=settings.get("time_code"), purposes=wanted.purposes, camera=wanted.camera
-    )
-    _check_scene(scene, limits)
-    width, height = image_size(choose_camera(scene, wanted.camera), wanted.image_width, wanted.image_height)
-    _check_size(width, height, wanted.samples, limits)
     overrides = settings.get("overrides") or {}
-    scene = _override(scene, overrides)
-    told = [*found, *scene.notices]
-    frame = render(scene, wanted, progress=lambda share, work: say(progress=share, stage=work))
-    _tell([*told, *frame.notices], say, limits)
-    correction = settings.get("color_correction") or "sRGB"
-    aovs = settings.get("aovs") or []
-    extension = settings["format"]
-    frame = replace(frame, metadata={**frame.metadata, **override_notes(overrides)})
+    sizes = [(width, 0) for width in settings.get("widths") or ()] or [(wanted.image_width, wanted.image_height)]
+    times = settings.get("time_codes") or [settings.get("time_code")]
+    count = len(sizes) * len(times)
+    session = Session() if count > 1 else None
+    done: list[dict[str, Any]] = []
+    for time_code in times:
+        scene = scene_from_stage(opened, time_code=time_code, purposes=wanted.purposes, camera=wanted.camera)
+        _check_scene(scene, limits)
+        camera = choose_camera(scene, wanted.camera)
+        measured = [image_size(camera, *size) for size in sizes]
+        _check_sizes(measured, len(times), wanted.samples, settings["format"], limits)
+        scene = _override(scene, overrides)
+        told += scene.notices
+        for width, height in measured:
+            this = replace(wanted, image_width=width, image_height=height)
+            frame = render(scene, this, session=session, progress=_share_of(say, len(done), count))
+            told += frame.notices
+            frame = replace(frame, metadata={**frame.metadata, **override_notes(overrides)})
+            _save_picture(frame, out, settings, f"picture.{len(done)}" if count > 1 else "image")
+            done.append({"width": frame.width, "height": frame.height, "time_code": float(scene.time_code)})
+    _tell(told, say, limits)
+    size = {"width": done[0]["width"], "height": done[0]["height"]}
+    if count > 1:
+        _pack_pictures(out, settings["format"], done)
+        return {**size, "pictures": done}
+    return {**size, "aovs": _save_planes(frame, out, settings)}
+
+
+def _share_of(say: Say, before: int, count: int) -> Callable[[float, str], None]:
+    """Progress of one picture of several as that of all."""
+    return lambda share, work: say(progress=(before + share) / count, stage=work)
+
+
+def _save_picture(frame: Frame, out: str, settings: Mapping[str, Any], name: str) -> None:
+    """The picture; where the format holds them, with the planes that were asked for, or all where none was."""
+    extension, aovs = settings["format"], settings.get("aovs") or []
     held = tuple(dict.fromkeys(("beauty", *aovs))) if aovs and extension == "exr" else ()
-    frame.save(os.path.join(out, f"image.{extension}"), aovs=held, color_correction=correction)
+    correction = settings.get("color_correction") or "sRGB"
+    frame.save(os.path.join(out, f"{name}.{extension}"), aovs=held, color_correction=correction)
+
+
+def _save_planes(frame: Frame, out: str, settings: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Every plane that was asked for as a PNG of its own. Returns what white means in each."""
     kept = []
-    for name in aovs:
+    for name in settings.get("aovs") or []:
         if name == "P":  # no picture holds positions
             continue
-        white = 1.0
+        white, shown = 1.0, frame
         if name in _UNITS:
             plane = frame.planes[name]
             finite = plane[np.isfinite(plane)]
             white = max(float(finite.max()) if finite.size else 1.0, 1e-9)
             shown = replace(frame, planes={name: (plane / np.float32(white)).astype(np.float32)})
-        else:
-            shown = frame
+        correction = settings.get("color_correction") or "sRGB"
         shown.save(os.path.join(out, f"aov.{name}.png"), aovs=[name], color_correction=correction)
         kept.append({"name": name, "white": white})
-    return {"width": frame.width, "height": frame.height, "aovs": kept}
+    return kept
+
+
+def _pack_pictures(out: str, extension: str, done: list[dict[str, Any]]) -> None:
+    """All pictures in one archive, beside themselves."""
+    with contextlib.ExitStack() as files:
+        named = {
+            f"{number:04}_{one['width']}x{one['height']}.{extension}": files.enter_context(
+                open(os.path.join(out, f"picture.{number}.{extension}"), "rb")
+            )
+            for number, one in enumerate(done)
+        }
+        uploads.pack(named, os.path.join(out, "pictures.zip"))
 
 
 def _check_scene(scene: Scene, limits: Mapping[str, int]) -> None:
@@ -196,12 +241,23 @@ def _check_scene(scene: Scene, limits: Mapping[str, int]) -> None:
         raise Problem("limit-exceeded", f"the stage has {triangles} triangles; the limit is {limits['triangles']}")
 
 
-def _check_size(width: int, height: int, samples: int, limits: Mapping[str, int]) -> None:
-    asked = {"pixels": width * height, "samples": samples, "pixel_samples": width * height * samples}
-    for name, value in asked.items():
-        if value > limits[name]:
-            what = f"{width} x {height} pixels with {samples} samples"
-            raise Problem("limit-exceeded", f"{what}: {name} would be {value}; the limit is {limits[name]}")
+def _check_sizes(
+    sizes: list[tuple[int, int]], times: int, samples: int, extension: str, limits: Mapping[str, int]
+) -> None:  # fmt: skip
+    longest = formats.BY_EXTENSION[extension].longest_side
+    for width, height in sizes:
+        what = f"{width} x {height} pixels with {samples} samples"
+        for name, value in {"pixels": width * height, "samples": samples}.items():
+            if value > limits[name]:
+                raise Problem("limit-exceeded", f"{what}: {name} would be {value}; the limit is {limits[name]}")
+        if max(width, height) > longest:
+            text = f"{width} x {height} pixels are more than a .{extension} can hold; its sides have at most {longest}"
+            raise Problem("invalid-settings", text, errors=[{"pointer": "/format", "detail": text}])
+    every = times * samples * sum(width * height for width, height in sizes)
+    if every > limits["pixel_samples"]:
+        what = f"{times * len(sizes)} pictures from {sizes[0][0]} x {sizes[0][1]} pixels on, with {samples} samples"
+        text = f"{what}: pixel_samples would be {every}; the limit is {limits['pixel_samples']}"
+        raise Problem("limit-exceeded", text)
 
 
 def _override(scene: Scene, overrides: Overrides) -> Scene:

@@ -21,6 +21,7 @@ from service_stages import HEAD, package, referring
 from refract_core.images.codec import encoded, exr_spec
 from refract_core.images.pictures import read_planes, read_texture
 from refract_core.verbs.convert import ConvertOrder, convert
+from service.formats import FORMATS, written
 from service.limits import Limits
 
 pytestmark = pytest.mark.slow
@@ -261,3 +262,112 @@ def binary(document: dict[str, Any], content: bytes) -> bytes:
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(content), 0x004E4942) + content
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+# --- formats
+
+
+STARTS = {"png": b"\x89PNG", "jpeg": b"\xff\xd8\xff", "webp": b"RIFF", "exr": b"\x76\x2f\x31\x01"}
+
+
+@pytest.mark.parametrize("name", [name for name in FORMATS if name != "avif"])
+def test_every_format_is_chosen_by_accept_and_by_name(client: httpx.Client, name: str) -> None:
+    media = FORMATS[name].media
+    by_header, by_name = render(client, upload(BALL), media), render(client, upload(BALL), "*/*", format=name)
+    assert by_header.headers["content-type"] == by_name.headers["content-type"] == media, by_header.text
+    assert by_header.content == by_name.content
+    assert by_header.headers["etag"] == by_name.headers["etag"]
+    assert by_header.content.startswith(STARTS[name])
+    image = client.get(f"{by_name.headers['content-location']}/image")
+    assert (image.headers["content-type"], image.content) == (media, by_name.content)
+    if name != "exr":  # which is linear
+        seen, plain = (over_black(pixels(one)) for one in (by_name, render(client, upload(BALL))))
+        assert np.abs(seen - plain).mean() < 0.02  # compression that an eye does not see
+
+
+def test_a_format_that_is_not_written_here_is_told_by_its_name(client: httpx.Client) -> None:
+    if written("avif"):
+        assert render(client, upload(BALL), "image/avif").content[4:12] == b"ftypavif"
+        return
+    for answer in (render(client, upload(BALL), "image/avif"), render(client, upload(BALL), "*/*", format="avif")):
+        assert answer.status_code == 406
+        assert "libheif" in answer.json()["detail"]
+        assert "image/webp" in answer.json()["detail"]
+    browser = render(client, upload(BALL), "image/avif,image/webp,*/*;q=0.8")
+    assert browser.headers["content-type"] == "image/webp"
+    assert render(client, upload(BALL), "image/jpeg", format="png").status_code == 406
+
+
+def over_black(rgba: Any) -> Any:
+    """Colours, shape (H, W, 3), in [0, 1]: where a picture is transparent they may be anything."""
+    return rgba[..., :3] / 255.0 * (rgba[..., 3:] / 255.0)
+
+
+# --- several pictures in one job
+
+
+def test_several_widths_and_times_are_one_job(client: httpx.Client) -> None:
+    stage = BALL.replace("double radius = 1", "double radius.timeSamples = { 0: 1, 1: 0.5 }")
+    wanted = {"widths": [16, 32], "time_codes": [0, 1], "samples": 1}
+    data = {"settings": json.dumps({**wanted, "format": "png"})}
+    answer = client.post("/v1/render", files=upload(stage), data=data)
+    assert answer.headers["content-type"] == "application/zip", answer.text
+    where = answer.headers["content-location"]
+    job = client.get(where).json()
+    assert [(one["width"], one["time_code"]) for one in job["pictures"]] == [(16, 0), (32, 0), (16, 1), (32, 1)]
+    archive = zipfile.ZipFile(io.BytesIO(answer.content))
+    assert len(archive.namelist()) == 4
+    assert client.get(job["links"]["pictures"]).content == answer.content
+    for one, name in zip(job["pictures"], archive.namelist(), strict=True):
+        single = render(client, upload(stage), image_width=one["width"], time_code=one["time_code"])
+        several = client.get(one["href"])
+        np.testing.assert_array_equal(pixels(several), pixels(single))
+        assert archive.read(name) == several.content
+        assert f"{one['width']}x{one['height']}" in name
+    assert client.get(f"{where}/image").content == client.get(job["pictures"][0]["href"]).content
+    assert client.get(f"{where}/pictures/4").status_code == client.get(f"{where}/pictures/x").status_code == 404
+
+
+@pytest.mark.parametrize(("settings", "pointer"), [
+    ({"widths": [16, 32], "image_width": 16}, "/image_width"), ({"time_codes": [0], "time_code": 0}, "/time_code"),
+    ({"widths": [16, 16]}, "/widths"), ({"widths": list(range(1, 60)), "time_codes": [0, 1]}, "/time_codes"),
+    ({"widths": [16, 32], "aovs": ["N"]}, "/aovs"), ({"widths": [1 << 23]}, "/widths"),
+])  # fmt: skip
+def test_several_pictures_are_asked_for_in_one_way(client: httpx.Client, settings: Any, pointer: str) -> None:
+    answer = client.post("/v1/render", files=upload(BALL), data={"settings": json.dumps(settings)})
+    assert answer.status_code == 422
+    assert [one["pointer"] for one in answer.json()["errors"]] == [pointer]
+
+
+def test_pixels_of_all_pictures_count_together(client: httpx.Client) -> None:
+    settings = {"widths": [1900, 1901], "samples": 64, "camera_light": True, "time_codes": list(range(20))}
+    answer = client.post("/v1/render", files=upload(BALL), data={"settings": json.dumps(settings)})
+    assert answer.json()["type"] == "/problems/limit-exceeded"
+    assert "pixel_samples" in answer.json()["detail"]
+
+
+# --- variants
+
+
+def test_a_variant_is_chosen_over_the_stages_own(client: httpx.Client) -> None:
+    size = '"{name}" {{\n            over "Ball"\n            {{\n                double radius = {radius}\n'
+    size += "            }}\n        }}"
+    head = '''def Xform "World" (
+    variants = {
+        string size = "large"
+    }
+    prepend variantSets = "size"
+)
+{'''
+    sets = "\n".join(size.format(name=name, radius=radius) for name, radius in (("large", 1), ("small", 0.5)))
+    stage = BALL.replace("        double radius = 1\n", "").replace('def Xform "World"\n{', head)
+    stage = stage.rstrip().removesuffix("}") + f'    variantSet "size" = {{\n        {sets}\n    }}\n}}\n'
+    plain = pixels(render(client, upload(stage)))
+    np.testing.assert_array_equal(pixels(render(client, upload(stage), variants=["/World{size=large}"])), plain)
+    small = pixels(render(client, upload(stage), variants=["{size=small}"]))
+    assert (small != plain).any()
+    expected = pixels(render(client, upload(BALL.replace("radius = 1", "radius = 0.5"))))
+    np.testing.assert_array_equal(small, expected)
+    for wrong in ("/World{size=huge}", "/World{paint=red}", "/Nowhere{size=small}"):
+        problem = render(client, upload(stage), variants=[wrong]).json()
+        assert problem["errors"][0]["pointer"] == "/variants"

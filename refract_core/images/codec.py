@@ -196,6 +196,15 @@ def exr_spec(
     return spec
 
 
+def writes(extension: str) -> bool:
+    """Whether this OpenImageIO can write a format, by the extension of its files; some are left out of some builds."""
+    import OpenImageIO as oiio
+
+    formats = set(str(oiio.get_string_attribute("output_format_list")).split(","))
+    known = (one.partition(":") for one in str(oiio.get_string_attribute("extension_list")).split(";"))
+    return any(name in formats and extension[1:] in extensions.split(",") for name, _, extensions in known)
+
+
 def encoded(path: str, pixels: NDArray[Any], spec: Any) -> bytes:
     """The whole file in memory: on a full disk some writers say nothing, and one ends the process.
 
