@@ -22,7 +22,7 @@ from refract_core.errors import UsageError
 from refract_core.verbs.executors import scheduler_of
 from refract_core.version import __version__
 
-from . import openapi, pages, routes
+from . import openapi, pages, routes, thumbnails
 from .edge import Edge
 from .jobs import Jobs
 from .limits import Limits
@@ -51,6 +51,8 @@ class Settings:
     """Address of a Dask cluster that does the jobs, `dask://HOST:PORT`; '' does them on this machine."""
     tokens: tuple[str, ...] = ()
     """Bearer tokens, one of which every request under /v1 must bring; none means open to all."""
+    key: str = ""
+    """Signs addresses of thumbnails, and webhooks; '' means neither."""
     limits: Limits = field(default_factory=Limits)
 
     def __post_init__(self) -> None:
@@ -64,6 +66,8 @@ class Settings:
             raise UsageError(f"--stage-root {self.stage_root}: there is no such folder")
         if any(len(token) < 8 for token in self.tokens):
             raise UsageError("a bearer token is shorter than 8 characters; take a long random one")
+        if self.key and len(self.key) < 16:
+            raise UsageError("the key is shorter than 16 characters; take a long random one")
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
@@ -100,10 +104,11 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         description="Renders USD stages with glass in them.", redirect_slashes=False,
     )  # fmt: skip
     app.state.jobs, app.state.settings, app.state.metrics = jobs, settings, metrics
-    app.add_middleware(Edge, tokens=settings.tokens, metrics=metrics)
+    app.add_middleware(Edge, tokens=settings.tokens, metrics=metrics, key=settings.key)
     _add_handlers(app)
     _add_pages(app, settings, metrics)
     app.include_router(routes.router)
+    app.include_router(thumbnails.router)
     openapi.describe(app, tokens=bool(settings.tokens))
     app.mount("/static", _Static(directory=_STATIC), name="static")
     return app
@@ -158,7 +163,8 @@ def _add_handlers(app: FastAPI) -> None:
 
 def _methods_here(request: Request) -> list[str]:
     """Methods of a path. Starlette names those of the first route that fits, and a path may have several."""
-    known = [*request.app.routes, *routes.router.routes]  # FastAPI shows the second as one, which has no methods
+    ours = [*routes.router.routes, *thumbnails.router.routes]  # FastAPI shows a router as one, which has no methods
+    known = [*request.app.routes, *ours]
     fitting = [route for route in known if route.matches(request.scope)[0] is not Match.NONE]
     return sorted({method for route in fitting for method in getattr(route, "methods", None) or ()}) or ["GET"]
 

@@ -66,12 +66,12 @@ async def _read(request: Request, model: type[StageOnly], limits: Limits, folder
     if request.headers.get("content-encoding", "identity").lower() != "identity":
         raise Problem("unsupported-media-type", "send the body without Content-Encoding")
     if media == "application/json":
-        limited = _limited(request, limits.settings_bytes)
-        settings = check(model, parse(b"".join([part async for part in limited.stream()])))
+        stream = limited(request, limits.settings_bytes).stream()
+        settings = check(model, parse(b"".join([part async for part in stream])))
         if settings.stage is None:
             raise invalid("/stage", "is missing; name a stage of GET /v1/stages, or upload one as multipart/form-data")
         return Wish(settings, None, "")
-    return await _read_form(_limited(request, limits.body_bytes), model, limits, folder)
+    return await _read_form(limited(request, limits.body_bytes), model, limits, folder)
 
 
 async def _read_form(request: Request, model: type[StageOnly], limits: Limits, folder: Path) -> Wish:
@@ -144,19 +144,27 @@ _SENDABLE = "the file is not USD; send .usda, .usdc, .usd, .usdz, .glb or .gltf,
 
 
 async def _suffix_of(stage: UploadFile) -> str:
-    """What a file is, by how it begins; packages and other archives begin alike, and are told apart by their names."""
     start = await stage.read(_START)
     await stage.seek(0)
+    return suffix_of(start, stage.filename or "")
+
+
+def suffix_of(start: bytes, name: str) -> str:
+    """What a file is, by how it begins; packages and other archives begin alike, and are told apart by their names.
+
+    Raises:
+        Problem: nothing that is read.
+    """
     for magic, suffix in _MAGIC.items():
         if start.startswith(magic):
-            zipped = suffix == ".usdz" and (stage.filename or "").lower().endswith(ARCHIVE)
+            zipped = suffix == ".usdz" and name.lower().endswith(ARCHIVE)
             return ARCHIVE if zipped else suffix
     if start.lstrip().startswith(b"{"):
         return ".gltf"
     raise Problem("unsupported-media-type", _SENDABLE)
 
 
-def _limited(request: Request, most: int) -> Request:
+def limited(request: Request, most: int) -> Request:
     """The same request, which raises as soon as it is known that the body is too large."""
     detail = f"the limit is {most} bytes"
     declared = request.headers.get("content-length", "")

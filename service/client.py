@@ -6,6 +6,7 @@ problem document in it. Needs nothing but Python's own library.
 
 from __future__ import annotations
 
+import hashlib
 import http.client
 import json
 import os
@@ -16,7 +17,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypedDict
-from urllib.parse import quote, urlsplit
+from urllib.parse import quote, urlencode, urlsplit
+
+from .signing import signed
 
 Kind = Literal["render", "convert", "inspect", "validate"]
 Source = str | Path | Mapping[str, bytes | Path]
@@ -77,6 +80,20 @@ class ConvertSettings(TypedDict, total=False):
     flatten: bool
 
 
+class Thumbnail(TypedDict, total=False):
+    """What the address of a thumbnail may ask for."""
+
+    w: int
+    """Width [pixels]."""
+    camera: str
+    variant: list[str]
+    """`/Prim{set=name}`, or `{set=name}` of the default prim."""
+    time: float
+    format: str
+    root: str
+    """Of an archive, the file to open."""
+
+
 Settings = RenderSettings | ConvertSettings
 
 
@@ -132,8 +149,9 @@ class Job:
     @staticmethod
     def of(document: Mapping[str, Any]) -> Job:
         """What this program knows of a document; a newer service may say more."""
-        told = {name: document[name] for name in Job.__dataclass_fields__ if name in document}
-        return Job(**{name: tuple(value) if isinstance(value, list) else value for name, value in told.items()})
+        told: dict[str, Any] = {name: document[name] for name in Job.__dataclass_fields__ if name in document}
+        lists: dict[str, Any] = {name: tuple(value) for name, value in told.items() if isinstance(value, list)}
+        return Job(**{**told, **lists})
 
 
 class Client:
@@ -223,6 +241,38 @@ class Client:
         """One plane of a render as a PNG. Raises Refused."""
         return self._result(*self._ask("GET", f"{_path_of(job)}/aovs/{quote(name, safe='')}.png"))
 
+    # --- thumbnails
+
+    def keep(self, stage: Path | bytes) -> str:
+        """Send a stage to stay for a while. Returns its digest, by which thumbnails are asked for. Raises Refused."""
+        content = stage if isinstance(stage, bytes) else stage.read_bytes()
+        zipped = isinstance(stage, Path) and stage.suffix.lower() == ".zip"
+        digest = hashlib.sha256(content).hexdigest()
+        media = "application/zip" if zipped else "application/octet-stream"
+        self._ask("PUT", f"/v1/stages/{digest}", content, {"Content-Type": media})
+        return digest
+
+    def thumbnail(self, stage: str, query: Thumbnail | None = None, *, etag: str = "") -> Result | None:
+        """A picture of a stage, by its name or its digest; None where the one with this ETag still holds.
+
+        Raises:
+            Refused: by the service.
+        """
+        path, asked = _thumbnail(stage, query or {})
+        headers = {"If-None-Match": etag} if etag else {}
+        found, content = self._ask("GET", f"{path}?{asked}" if asked else path, headers=headers)
+        return self._result(found, content) if content else None
+
+    def thumbnail_address(self, stage: str, query: Thumbnail | None = None, *, key: str, seconds: int) -> str:
+        """An address that anybody may open for a while. Nothing is asked of the service.
+
+        Args:
+            key: what the service has as its `--key-file`.
+            seconds: for how long.
+        """
+        path, asked = _thumbnail(stage, query or {})
+        return self.url + signed(key, path, asked, int(time.time()) + seconds)
+
     # --- about the service
 
     def stages(self) -> list[str]:
@@ -291,6 +341,11 @@ def _check(answer: http.client.HTTPResponse) -> None:
     if not isinstance(document, dict):  # of something between us and the service
         document = {"title": f"status {answer.status}", "status": answer.status, "detail": answer.reason}
     raise Refused(document, float(wait) if wait.isdigit() else None)
+
+
+def _thumbnail(stage: str, query: Thumbnail) -> tuple[str, str]:
+    """Path and query of a thumbnail."""
+    return f"/v1/thumbnails/{quote(stage)}", urlencode(query, doseq=True)
 
 
 def _path_of(job: Job | str) -> str:

@@ -15,11 +15,14 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from .metrics import Metrics
 from .problems import MEDIA_TYPE, Problem, of_status, respond
+from .signing import expiry
 
 _LINGER = 2.0
 """[s] A client that is still sending when it is refused would lose the answer if the connection closed at once."""
 _RANGE = re.compile(rb"bytes=\s*(\d{0,18})-(\d{0,18})\s*", re.IGNORECASE)
 _POLICY = "default-src 'self'; img-src 'self' blob: data:; object-src 'none'; base-uri 'none'; frame-ancestors 'none'"
+SIGNABLE = "/v1/thumbnails/"
+"""Where the addresses begin that a signature opens."""
 GUARDS = ((b"x-content-type-options", b"nosniff"), (b"referrer-policy", b"no-referrer"),
           (b"content-security-policy", _POLICY.encode()))  # fmt: skip
 """Headers that every answer carries."""
@@ -28,8 +31,8 @@ GUARDS = ((b"x-content-type-options", b"nosniff"), (b"referrer-policy", b"no-ref
 class Edge:
     """ASGI middleware."""
 
-    def __init__(self, app: ASGIApp, *, tokens: Sequence[str], metrics: Metrics) -> None:
-        self.app, self.metrics = app, metrics
+    def __init__(self, app: ASGIApp, *, tokens: Sequence[str], metrics: Metrics, key: str = "") -> None:
+        self.app, self.metrics, self.key = app, metrics, key
         self.tokens = [token.encode() for token in tokens]
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -79,7 +82,7 @@ class Edge:
 
     def _refusal(self, scope: Scope, headers: Headers) -> Problem | None:
         path = scope["path"]
-        if self.tokens and guarded(path):
+        if self.tokens and guarded(path) and not self._signed(scope):
             scheme, _, given = headers.get("authorization", "").partition(" ")
             matches = [hmac.compare_digest(given.strip().encode(), token) for token in self.tokens]
             if scheme.lower() != "bearer" or not any(matches):
@@ -88,6 +91,13 @@ class Edge:
         if scope["method"] not in ("GET", "HEAD", "OPTIONS") and origin and not _same_host(origin, headers):
             return Problem("cross-origin", "a page of another site may not ask for work here")
         return None
+
+
+    def _signed(self, scope: Scope) -> bool:
+        """An address that may be opened without a token."""
+        raw, query = (scope.get(part, b"").decode("latin-1") for part in ("raw_path", "query_string"))
+        reads = scope["method"] in ("GET", "HEAD") and scope["path"].startswith(SIGNABLE)
+        return reads and expiry(self.key, raw, query, time.time()) is not None
 
 
 def guarded(path: str) -> bool:

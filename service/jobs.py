@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hashlib
-import json
 import logging
 import math
 import os
@@ -19,7 +17,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from .digests import engine
+from .digests import identifier_of
 from .limits import Limits
 from .metrics import Metrics
 from .pool import Source, Worker
@@ -128,8 +126,7 @@ class Jobs:
             stage: path under the stage root, or the name the uploaded file shall have.
             upload: the uploaded file, which is moved; None for a stage of ours.
         """
-        wish = json.dumps([kind, engine(), digest, settings], sort_keys=True, allow_nan=False)
-        identifier = hashlib.sha256(wish.encode()).hexdigest()
+        identifier = identifier_of(kind, settings, digest)
         known = self.records.get(identifier)
         if known and known.status in ("queued", "running", "done"):
             self.metrics.cached.inc()

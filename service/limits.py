@@ -49,6 +49,7 @@ class Limits:
     event_streams: int = _limit(100, "streams", "clients that listen to events at once")
     retention_seconds: int = _limit(24 * 3600, "s", "time a finished job and its results are kept")
     retention_bytes: int = _limit(2 << 30, "bytes", "results kept in all; the oldest go first")
+    kept_bytes: int = _limit(1 << 30, "bytes", "stages kept by their digests; those not asked for the longest go first")
     drain_seconds: int = _limit(20, "s", "time running jobs get to finish when the service is asked to stop")
 
     def __post_init__(self) -> None:

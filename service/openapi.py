@@ -40,6 +40,8 @@ _RESULT_HEADERS = {
 }
 _PATHS: dict[str, Any] = {
     "identifier": {"type": "string", "pattern": "^[0-9a-f]{64}$"},
+    "digest": {"type": "string", "pattern": "^[0-9a-f]{64}$"},
+    "stage": {"type": "string", "minLength": 1},
     "number": {"type": "integer", "minimum": 0, "maximum": 9999},
     "name": {"type": "string", "enum": [name for name in get_args(models.Aov) if name != "P"]},
 }
@@ -101,6 +103,30 @@ def result(what: str, *media: str) -> dict[str, Any]:
     same = {"description": "with `If-None-Match`: it is there already", "headers": _RESULT_HEADERS}
     answers = {200: whole, 206: part, 304: same, **problems(404, 409, 416)}
     return {"openapi_extra": {"parameters": _CONDITIONS}, "responses": answers}
+
+
+def stage_by_digest() -> dict[str, Any]:
+    """Keywords for the route that keeps a stage."""
+    body = {"required": True, "content": {
+        media: {"schema": {"type": "string", "format": "binary"}}
+        for media in ("application/octet-stream", "application/zip")
+    }}  # fmt: skip
+    made = {"description": "the stage is kept", "headers": {"Location": _header("its thumbnail")}}
+    answers = {201: made, 204: {"description": "it was there already"}, **problems(403, 404, 408, 413, 415, 422)}
+    return {"openapi_extra": {"requestBody": body}, "responses": answers}
+
+
+def thumbnail(query: dict[str, tuple[str, dict[str, Any]]], media: Iterable[str]) -> dict[str, Any]:
+    """Keywords for the route of thumbnails.
+
+    Args:
+        query: name of a parameter -> description and schema.
+    """
+    asked = [{"name": name, "in": "query", "required": False, "description": text, "schema": schema}
+             for name, (text, schema) in query.items()]  # fmt: skip
+    found = result("the picture", *media)
+    return {"openapi_extra": {"parameters": [*asked, *_CONDITIONS]},
+            "responses": {**found["responses"], **problems(*WORK)}}  # fmt: skip
 
 
 def _body(model: type[models.StageOnly]) -> dict[str, Any]:

@@ -36,7 +36,7 @@ _OBJECT: dict[str, Any] = {"type": "object"}
 _CONVERTED = {"type": "object", "required": ["stage", "out", "materials", "notices"]}
 
 
-def _jobs(request: Request) -> Jobs:
+def jobs_of(request: Request) -> Jobs:
     jobs: Jobs = request.app.state.jobs
     return jobs
 
@@ -104,18 +104,23 @@ def _given(request: Request, *known: str) -> Ask:
 
 
 async def _work(request: Request, kind: str, ask: Ask) -> Response:
-    jobs = _jobs(request)
+    jobs = jobs_of(request)
     with jobs.place():
         record, media = await _submit(request, kind, ask, jobs)
     if "respond-async" in request.headers.get("prefer", "").lower():
         jobs.keep(record)
         headers = {"Location": f"/v1/jobs/{record.id}", "Preference-Applied": "respond-async"}
         return JSONResponse(record.document(), 202, headers)
+    return await finished(request, jobs, record) or result(request, jobs, record, _file_of(record, media))
+
+
+async def finished(request: Request, jobs: Jobs, record: Record) -> Response | None:
+    """Wait for a job. Returns None when it is done, and else the answer."""
     if not await _done_or_gone(request, jobs, record):
         return Response(status_code=499)
     if record.problem:
         return document_response(record.problem, {"Content-Location": f"/v1/jobs/{record.id}"})
-    return _result(request, jobs, record, _file_of(record, media))
+    return None
 
 
 async def _submit(request: Request, kind: str, ask: Ask, jobs: Jobs) -> tuple[Record, str]:
@@ -126,7 +131,7 @@ async def _submit(request: Request, kind: str, ask: Ask, jobs: Jobs) -> tuple[Re
         media = ask(settings, request.headers.get("accept", ""))
         if wish.inner:
             settings["stage"] = wish.inner
-        _check_limits(settings, jobs)
+        check_limits(settings, jobs)
         if wish.upload:
             digest, stage = await asyncio.to_thread(file_digest, wish.upload), f"stage{wish.suffix}"
         else:
@@ -140,7 +145,7 @@ async def _submit(request: Request, kind: str, ask: Ask, jobs: Jobs) -> tuple[Re
             wish.upload.unlink(missing_ok=True)
 
 
-def _check_limits(settings: dict[str, Any], jobs: Jobs) -> None:
+def check_limits(settings: dict[str, Any], jobs: Jobs) -> None:
     """What can be told before the stage is read; its worker looks again at what follows from the stage."""
     limits = asdict(jobs.limits)
     height, samples = (settings.get(name) or 1 for name in ("image_height", "samples"))
@@ -187,7 +192,7 @@ async def _done_or_gone(request: Request, jobs: Jobs, record: Record) -> bool:
 
 
 def _known(request: Request, identifier: str) -> Record:
-    record = _jobs(request).records.get(identifier)
+    record = jobs_of(request).records.get(identifier)
     if record is None:
         raise Problem("not-found", "there is no such job; it may have been removed")
     return record
@@ -203,7 +208,7 @@ async def job(request: Request, identifier: str) -> Response:
 async def cancel(request: Request, identifier: str) -> Response:
     """Cancel a job: its process is killed. A job that has ended stays as it is."""
     record = _known(request, identifier)
-    await _jobs(request).cancel(record)
+    await jobs_of(request).cancel(record)
     return JSONResponse(record.document())
 
 
@@ -212,7 +217,7 @@ async def cancel(request: Request, identifier: str) -> Response:
 })  # fmt: skip
 async def events(request: Request, identifier: str) -> StreamingResponse:
     """Progress as server-sent events: `progress`, then one of `done`, `failed`, `cancelled`; data is the job."""
-    record, jobs = _known(request, identifier), _jobs(request)
+    record, jobs = _known(request, identifier), jobs_of(request)
     if jobs.streams >= jobs.limits.event_streams:
         raise Problem("queue-full", "too many clients listen to events", headers={"Retry-After": "5"})
 
@@ -241,7 +246,7 @@ def _file_of(record: Record, media: str = "") -> str:
     return "converted.usdz" if record.kind == "convert" and media != "application/json" else "report.json"
 
 
-def _result(request: Request, jobs: Jobs, record: Record, name: str) -> Response:
+def result(request: Request, jobs: Jobs, record: Record, name: str) -> Response:
     """One file of a job, or 304."""
     if record.problem:
         problem = Problem("not-done", f"the job is {record.status}")
@@ -273,7 +278,7 @@ async def pictures(request: Request, identifier: str) -> Response:
     record = _known(request, identifier)
     if record.kind != "render" or _count(record.settings) < 2:
         raise Problem("not-found", "the job does not make several pictures")
-    return _result(request, _jobs(request), record, _file_of(record))
+    return result(request, jobs_of(request), record, _file_of(record))
 
 
 @router.get("/jobs/{identifier}/pictures/{number}", response_class=Response,
@@ -288,25 +293,25 @@ def _picture(request: Request, identifier: str, number: int) -> Response:
     if record.kind != "render" or not 0 <= number < _count(record.settings):
         raise Problem("not-found", "the job makes no such picture")
     name = f"picture.{number}" if _count(record.settings) > 1 else "image"
-    return _result(request, _jobs(request), record, f"{name}.{record.settings['format']}")
+    return result(request, jobs_of(request), record, f"{name}.{record.settings['format']}")
 
 
 @router.get("/jobs/{identifier}/aovs/{name}.png", response_class=Response, **openapi.result("the picture", "image/png"))
 async def aov(request: Request, identifier: str, name: str) -> Response:
     """One AOV of a render that asked for it, as 8-bit grey or colour; the job says what white is."""
-    return _result(request, _jobs(request), _known(request, identifier), f"aov.{name}.png")
+    return result(request, jobs_of(request), _known(request, identifier), f"aov.{name}.png")
 
 
 @router.get("/jobs/{identifier}/file", response_class=Response, **openapi.result("the stage", "model/vnd.usdz+zip"))
 async def converted(request: Request, identifier: str) -> Response:
     """The stage that a conversion made."""
-    return _result(request, _jobs(request), _known(request, identifier), "converted.usdz")
+    return result(request, jobs_of(request), _known(request, identifier), "converted.usdz")
 
 
 @router.get("/jobs/{identifier}/report", response_class=Response, **openapi.result("the report", "application/json"))
 async def report(request: Request, identifier: str) -> Response:
     """What a conversion, inspection or validation found."""
-    return _result(request, _jobs(request), _known(request, identifier), "report.json")
+    return result(request, jobs_of(request), _known(request, identifier), "report.json")
 
 
 # --- about the service ------------------------------------------------------------------------------------------------
@@ -315,13 +320,13 @@ async def report(request: Request, identifier: str) -> Response:
 @router.get("/stages", response_model=models.Stages)
 async def own_stages(request: Request) -> dict[str, list[dict[str, Any]]]:
     """Stages that a request may name."""
-    return {"stages": await asyncio.to_thread(stages, _jobs(request).stage_root)}
+    return {"stages": await asyncio.to_thread(stages, jobs_of(request).stage_root)}
 
 
 @router.get("/limits", response_model=models.LimitTable)
 async def show_limits(request: Request) -> dict[str, Any]:
     """Every limit, and what confines workers on this machine."""
-    jobs = _jobs(request)
+    jobs = jobs_of(request)
     return {
         "limits": table(jobs.limits), "workers": jobs.workers, "queue": jobs.places - jobs.workers,
         "confinement": jobs.source.report,

@@ -60,7 +60,7 @@ def test_stages_are_drawn_by_name_by_file_and_by_files(ours: Client, tmp_path: P
     single = ours.render(tmp_path / "ball.usda", SMALL)
     assert single.content.startswith(b"\x89PNG")
     assert ours.image(single.job).content == single.content
-    files = {"a/shot.usda": referring("../b.usda").encode(), "b.usda": tmp_path / "ball.usda"}
+    files: dict[str, bytes | Path] = {"a/shot.usda": referring("../b.usda").encode(), "b.usda": tmp_path / "ball.usda"}
     several = ours.render(files, {**SMALL, "stage": "a/shot.usda"})
     assert (several.warnings, several.media_type) == (single.warnings, "image/png")
     assert ours.inspect(files, stage="a/shot.usda")["stage"] == "a/shot.usda"
