@@ -30,6 +30,7 @@ from .metrics import CONTENT_TYPE, Metrics
 from .pool import Nursery, Source
 from .problems import BY_STATUS, KINDS, MEDIA_TYPE, Problem, respond
 from .store import Store
+from .webhooks import Webhooks
 
 log = logging.getLogger("refract.service")
 _STATIC = Path(__file__).parent / "static"
@@ -89,6 +90,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         stage_root=root,
     )  # fmt: skip
 
+    webhooks = Webhooks(settings.key, settings.limits.webhooks)
+
     @contextlib.asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         jobs.start()
@@ -96,6 +99,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             yield
         finally:
             await jobs.stop()
+            await webhooks.stop()
             if not settings.data:
                 shutil.rmtree(data, ignore_errors=True)
 
@@ -103,6 +107,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         title="refract", version=__version__, docs_url=None, redoc_url=None, lifespan=lifespan,
         description="Renders USD stages with glass in them.", redirect_slashes=False,
     )  # fmt: skip
+    app.state.webhooks = webhooks
     app.state.jobs, app.state.settings, app.state.metrics = jobs, settings, metrics
     app.add_middleware(Edge, tokens=settings.tokens, metrics=metrics, key=settings.key)
     _add_handlers(app)

@@ -43,6 +43,8 @@ class RenderSettings(TypedDict, total=False):
 
     stage: str
     """Of an upload of several files, the one to open."""
+    webhook: str
+    """Address that is told when the job has ended; `signing.is_from` says whether the service did it."""
     camera: str
     image_width: int
     image_height: int
@@ -73,6 +75,7 @@ class ConvertSettings(TypedDict, total=False):
     """What a conversion may ask for."""
 
     stage: str
+    webhook: str
     model: str
     only: list[str]
     thickness: str

@@ -47,6 +47,7 @@ class Limits:
     open_files: int = _limit(256, "files", "files open at once in a job")
     warnings: int = _limit(200, "entries", "warnings kept of one job")
     event_streams: int = _limit(100, "streams", "clients that listen to events at once")
+    webhooks: int = _limit(256, "webhooks", "webhooks still to be sent")
     retention_seconds: int = _limit(24 * 3600, "s", "time a finished job and its results are kept")
     retention_bytes: int = _limit(2 << 30, "bytes", "results kept in all; the oldest go first")
     kept_bytes: int = _limit(1 << 30, "bytes", "stages kept by their digests; those not asked for the longest go first")

@@ -29,6 +29,7 @@ Variant = Annotated[
 ]
 Unit = Annotated[float, Field(ge=0.0, le=1.0)]
 Length = Annotated[float, Field(gt=0.0, le=1e9, description="in the stage's own units")]
+Address = Annotated[str, StringConstraints(min_length=8, max_length=2048, pattern="^https?://[!-~]+$")]
 
 
 class Strict(BaseModel):
@@ -53,6 +54,9 @@ class StageOnly(Strict):
         "a stage of GET /v1/stages; of an upload of several files, the one to open; leave it out when one file is "
         "uploaded"
     ))  # fmt: skip
+    webhook: Address | None = Field(
+        None, description="address that is told when the job has ended, by a signed POST of the job"
+    )
 
 
 class Render(StageOnly):

@@ -22,6 +22,7 @@ from .limits import table
 from .openapi import problems
 from .problems import Problem, document_response
 from .store import RESULTS, Record
+from .webhooks import Webhooks
 
 router = APIRouter(prefix="/v1")
 _KEEP_ALIVE = 15.0  # [s] between comments in a quiet stream of events
@@ -127,11 +128,14 @@ async def _submit(request: Request, kind: str, ask: Ask, jobs: Jobs) -> tuple[Re
     """The job of a request, and the media type of its answer."""
     wish = await read_wish(request, models.KINDS[kind], jobs.limits, jobs.store.work)
     try:
-        settings = wish.settings.model_dump(exclude_none=True, exclude={"stage"})
+        settings = wish.settings.model_dump(exclude_none=True, exclude={"stage", "webhook"})
         media = ask(settings, request.headers.get("accept", ""))
         if wish.inner:
             settings["stage"] = wish.inner
         check_limits(settings, jobs)
+        hook: Webhooks = request.app.state.webhooks
+        if wish.settings.webhook:
+            await hook.check(wish.settings.webhook)
         if wish.upload:
             digest, stage = await asyncio.to_thread(file_digest, wish.upload), f"stage{wish.suffix}"
         else:
@@ -139,7 +143,11 @@ async def _submit(request: Request, kind: str, ask: Ask, jobs: Jobs) -> tuple[Re
             stage = own_stage(jobs.stage_root, wish.settings.stage)
             assert jobs.stage_root is not None
             digest = await asyncio.to_thread(tree_digest, jobs.stage_root, stage)
-        return jobs.submit(kind, settings, digest, stage, wish.upload), media
+        record = jobs.submit(kind, settings, digest, stage, wish.upload)
+        if wish.settings.webhook:
+            jobs.keep(record)
+            hook.follow(jobs, record, wish.settings.webhook)
+        return record, media
     finally:
         if wish.upload:
             wish.upload.unlink(missing_ok=True)

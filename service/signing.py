@@ -14,6 +14,19 @@ def signature_of(key: str, message: bytes) -> str:
     return hmac.new(key.encode(), message, hashlib.sha256).hexdigest()
 
 
+def is_from(key: str, timestamp: str, signature: str, body: bytes, *, now: float, tolerance: float = 300.0) -> bool:
+    """Whether a webhook was sent by the service that has the key, just now.
+
+    Args:
+        timestamp: the header Refract-Timestamp.
+        signature: the header Refract-Signature.
+        tolerance: [s] by which the clocks may differ; what is older may have been recorded, and sent again.
+    """
+    good = f"v1={signature_of(key, f'{timestamp}.'.encode() + body)}"
+    timely = timestamp.isascii() and timestamp.isdigit() and abs(now - int(timestamp[:12])) <= tolerance
+    return hmac.compare_digest(good.encode(), signature.encode()) and timely
+
+
 def signed(key: str, path: str, query: str, expires: int) -> str:
     """An address that holds until a time.
 
