@@ -9,7 +9,7 @@ from fastapi import FastAPI
 
 from . import models
 from .edge import guarded
-from .problems import KINDS, MEDIA_TYPE
+from .problems import KINDS, MEDIA_TYPE, Problem
 
 Answers = dict[int | str, dict[str, Any]]
 _PROBLEM = {"$ref": "#/components/schemas/ProblemDocument"}
@@ -38,6 +38,21 @@ _RESULT_HEADERS = {
     "Cache-Control": _header("a result never changes"),
     "Vary": _header("Accept, which chooses the format"),
 }
+_TAGS = (
+    ("work", ("/v1/render", "/v1/convert", "/v1/inspect", "/v1/validate"), "what is done with a stage"),
+    ("jobs", ("/v1/jobs",), "how a job is doing, and what it made"),
+    ("thumbnails", ("/v1/thumbnails", "/v1/stages/"), "pictures with an address, and the stages sent for them"),
+    ("service", ("/",), "the service itself"),
+)
+"""Tag, how the paths that have it begin (the first that fits counts), and what it means."""
+_EXAMPLES: dict[str, dict[str, Any]] = {
+    "as it is": {"stage": "marble.usda"},
+    "small and quick": {"stage": "marble.usda", "image_width": 320, "samples": 1},
+    "sizes for a shop": {"stage": "marble.usda", "widths": [64, 256, 1024], "format": "webp"},
+    "another glass": {"stage": "marble.usda", "overrides": {"/World/Looks/Amber": {"ior": 1.33}}},
+    "for glTF": {"stage": "preview_surface.usda", "to": "gltf", "thickness": "measured"},
+}
+"""Bodies, each for the requests that have these fields."""
 _PATHS: dict[str, Any] = {
     "identifier": {"type": "string", "pattern": "^[0-9a-f]{64}$"},
     "digest": {"type": "string", "pattern": "^[0-9a-f]{64}$"},
@@ -61,12 +76,18 @@ _CONDITIONS = [
 ]
 
 
+def _problem(status: int) -> dict[str, Any]:
+    """A problem document, and one of this status."""
+    slug = next(slug for slug, kind in KINDS.items() if kind.status == status)
+    return {"schema": _PROBLEM, "example": Problem(slug, KINDS[slug].about).document()}
+
+
 def problems(*statuses: int) -> Answers:
     """Answers that are problem documents."""
     return {
         status: {
             "description": " or ".join(sorted({kind.title for kind in KINDS.values() if kind.status == status})),
-            "content": {MEDIA_TYPE: {"schema": _PROBLEM}}, "headers": _HEADERS_OF.get(status, {}),
+            "content": {MEDIA_TYPE: _problem(status)}, "headers": _HEADERS_OF.get(status, {}),
         }
         for status in statuses
     }  # fmt: skip
@@ -112,8 +133,9 @@ def stage_by_digest() -> dict[str, Any]:
         for media in ("application/octet-stream", "application/zip")
     }}  # fmt: skip
     made = {"description": "the stage is kept", "headers": {"Location": _header("its thumbnail")}}
-    answers = {201: made, 204: {"description": "it was there already"}, **problems(403, 404, 408, 413, 415, 422)}
-    return {"openapi_extra": {"requestBody": body}, "responses": answers}
+    there = {"description": "it was there already"}
+    refusals = problems(403, 404, 408, 413, 415, 422, 429, 503)
+    return {"openapi_extra": {"requestBody": body}, "responses": {201: made, 204: there, **refusals}}
 
 
 def thumbnail(query: dict[str, tuple[str, dict[str, Any]]], media: Iterable[str]) -> dict[str, Any]:
@@ -153,7 +175,9 @@ def _body(model: type[models.StageOnly]) -> dict[str, Any]:
             "settings": settings,
         },
     }  # fmt: skip
-    content = {"application/json": {"schema": ours}, "multipart/form-data": {"schema": form}}
+    fitting = {name: value for name, value in _EXAMPLES.items() if value.keys() <= model.model_fields.keys()}
+    examples = {name: {"value": value} for name, value in fitting.items()}
+    content = {"application/json": {"schema": ours, "examples": examples}, "multipart/form-data": {"schema": form}}
     return {"required": True, "content": content}
 
 
@@ -205,8 +229,11 @@ def _completed(found: dict[str, Any], tokens: bool) -> dict[str, Any]:
     for path, operations in found["paths"].items():
         for operation in operations.values():
             _complete(operation, guarded(path) and tokens)
+            operation["tags"] = [next(tag for tag, starts, _ in _TAGS if path.startswith(starts))]
     numbers = found["paths"]["/metrics"]["get"]["responses"]["200"]
     numbers["content"] = {"text/plain": {"schema": {"type": "string"}}}
+    found["tags"] = [{"name": tag, "description": text} for tag, _, text in _TAGS]
+    found["servers"] = [{"url": "/", "description": "where this document comes from"}]
     parts = found.setdefault("components", {})
     for name in ("HTTPValidationError", "ValidationError"):  # FastAPI's own, which nobody is ever sent
         parts.get("schemas", {}).pop(name, None)
@@ -227,7 +254,7 @@ def _complete(operation: dict[str, Any], guard: bool) -> None:
     for status, answer in answers.items():
         answer["headers"] = {**_HEADERS_OF.get(int(status), {}), **answer.get("headers", {}), **_REQUEST_ID}
         if MEDIA_TYPE in answer.get("content", {}):
-            answer["content"][MEDIA_TYPE] = {"schema": _PROBLEM}
+            answer["content"][MEDIA_TYPE] = _problem(int(status))
     operation["responses"] = dict(sorted(answers.items()))
 
 

@@ -66,7 +66,8 @@ async def keep_stage(request: Request, digest: str) -> Response:
         return Response(status_code=204)
     path = jobs.store.work / f"upload-{secrets.token_hex(8)}"
     try:
-        suffix = await _receive(request, digest, path, jobs)
+        with jobs.place():  # so that bodies are as many as jobs may be
+            suffix = await _receive(request, digest, path, jobs)
         await asyncio.to_thread(shelf.put, digest, suffix, path)
     finally:
         path.unlink(missing_ok=True)
