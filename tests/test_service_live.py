@@ -549,7 +549,7 @@ def test_an_exception_in_a_worker_is_a_fault_of_ours(monkeypatch: pytest.MonkeyP
         monkeypatch.setattr(worker, "_perform", fail)
         ours, theirs = socket.socketpair()
         with ours, theirs:
-            ours.sendall(b"{}\n")
+            ours.sendall(json.dumps({"folder": "/", "stage": "a.usda", "limits": asdict(Limits())}).encode() + b"\n")
             assert worker._serve(theirs.fileno(), os.open(os.devnull, os.O_WRONLY)) == 0
             said = [json.loads(line) for line in ours.recv(65536).splitlines()]
         assert said[0] == {"began": True}
