@@ -89,6 +89,7 @@ def perform(kind: str, stage: str, out: str, settings: Mapping[str, Any], limits
         raise Problem("invalid-settings", _public(str(error))) from None
     except (SceneError, ImageError) as error:
         if "cannot be encoded" in str(error):  # a picture of ours, not of the stage
+            _check_room(limits["result_bytes"])
             text = "a picture of this size and form is larger than this service or its format allows"
             raise Problem("limit-exceeded", text) from error
         raise Problem("stage-invalid", _public(str(error))) from None
@@ -99,6 +100,12 @@ def perform(kind: str, stage: str, out: str, settings: Mapping[str, Any], limits
         raise Problem("memory-limit", "the job ran out of memory") from error
     except RefractError as error:
         raise Problem("stage-invalid", _public(str(error))) from None
+
+
+def _check_room(size: int) -> None:
+    """Writers of pictures do not say why they fail. Raises OSError where there is no room for the largest result."""
+    with tempfile.TemporaryFile() as file:
+        os.posix_fallocate(file.fileno(), 0, size)
 
 
 def _as_usd(stage: str, say: Say, limits: Mapping[str, int]) -> str:
