@@ -191,6 +191,18 @@ def test_a_zip_is_one_stage(client: httpx.Client, method: int) -> None:
     assert any(name.endswith(".png") for name in inside)  # the converted package is whole
 
 
+def test_as_many_files_as_are_allowed_fit_into_the_folder_of_a_job(client: httpx.Client) -> None:
+    """Each in a folder of its own: nearly twice as many as a job may have beside its upload."""
+    stream, limits = io.BytesIO(), Limits()
+    count = limits.upload_files - 1
+    assert 2 * count > limits.folder_files
+    with zipfile.ZipFile(stream, "w") as archive:
+        archive.writestr("a.usda", BALL)
+        for number in range(count):
+            archive.writestr(f"{number}/x.bin", bytes(60_000))
+    assert render(client, {"stage": ("a.zip", stream.getvalue())}).status_code == 200
+
+
 @pytest.mark.parametrize("reference", ["../../../x.usda", "/etc/passwd", "../x.usda"])
 def test_nothing_leaves_the_folder_of_an_upload(client: httpx.Client, reference: str) -> None:
     parts = [("file", ("a.usda", referring(reference).encode())), ("file", ("b/c.usda", BALL.encode()))]

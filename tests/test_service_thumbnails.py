@@ -23,13 +23,16 @@ from service.signing import expiry, signed
 
 GOOD = ROOT / "usd_samples" / "good"
 TOKEN, KEY = "a-token-of-the-tests", "a-key-of-the-tests"
+READER, SHOP = "a-token-that-reads", "a-token-of-a-shop"
 AUTHORIZED = {"Authorization": f"Bearer {TOKEN}"}
 
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     folder = tmp_path_factory.mktemp("thumbnails")
-    (folder / "tokens").write_text(TOKEN)
+    named = ((READER, "reader", "read"), (SHOP, "shop", "read,render"))
+    lines = [f"{name} sha256:{hashlib.sha256(token.encode()).hexdigest()} {scopes}" for token, name, scopes in named]
+    (folder / "tokens").write_text("\n".join([TOKEN, *lines]))
     (folder / "key").write_text(KEY)
     words = ("--stage-root", str(GOOD), "--workers", "1", "--token-file", str(folder / "tokens"), "--key-file",
              str(folder / "key"), *PATIENT)  # fmt: skip
@@ -164,6 +167,23 @@ def test_a_signed_address_is_open_to_all_until_its_time(client: httpx.Client, se
         over = ours.thumbnail_address("window.usda", {"w": 40}, key=KEY, seconds=-1)
         assert anybody.get(over).status_code == 401
         assert anybody.get(address.replace("/thumbnails/", "/jobs/")).status_code == 401
+
+
+@pytest.mark.slow
+def test_a_thumbnail_is_work_and_belongs_to_who_asks(client: httpx.Client, server: Server) -> None:
+    path = "/v1/thumbnails/window.usda?w=24"
+    address = Client(server.url).thumbnail_address("window.usda", {"w": 24}, key=KEY, seconds=600)
+    with server.client(headers={"Authorization": f"Bearer {READER}"}) as reader:
+        assert reader.get(path).json()["type"] == "/problems/forbidden"
+        signed_one = reader.get(address)
+        assert width_of(signed_one) == 24
+    with server.client(headers={"Authorization": f"Bearer {SHOP}"}) as shop:
+        theirs, ours = shop.get(path), client.get(path)
+        jobs = {answer.headers["content-location"] for answer in (theirs, ours, signed_one)}
+        assert len(jobs) == 3
+        assert shop.get(theirs.headers["content-location"]).status_code == 200
+        assert client.get(theirs.headers["content-location"]).status_code == 404
+        assert shop.get(signed_one.headers["content-location"]).status_code == 404
 
 
 @pytest.mark.slow
