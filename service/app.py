@@ -24,7 +24,7 @@ from refract_core.errors import UsageError
 from refract_core.verbs.executors import scheduler_of
 from refract_core.version import __version__
 
-from . import openapi, pages, routes
+from . import openapi, pages, routes, thumbnails
 from .edge import Edge
 from .holding import Hold
 from .hosts import door
@@ -37,6 +37,7 @@ from .problems import BY_STATUS, KINDS, MEDIA_TYPE, Problem, respond
 from .shortage import problem_of
 from .store import Store
 from .tokens import tokens_of
+from .webhooks import Webhooks
 
 log = logging.getLogger("refract.service")
 _STATIC = Path(__file__).parent / "static"
@@ -66,6 +67,8 @@ class Settings:
     """Addresses of reverse proxies, or networks of them, which are believed in `X-Forwarded-For`."""
     tokens: tuple[str, ...] = ()
     """Lines of a token file; every request under /v1 must bring one of the tokens. None means open to all."""
+    key: str = ""
+    """Signs addresses of thumbnails, and webhooks; '' means neither."""
     limits: Limits = field(default_factory=Limits)
 
     def __post_init__(self) -> None:
@@ -84,6 +87,8 @@ class Settings:
             except ValueError as error:
                 raise UsageError(f"--proxy {proxy}: write an address, such as 127.0.0.1, or 10.0.0.0/8") from error
         tokens_of(self.tokens)
+        if self.key and len(self.key) < 16:
+            raise UsageError("the key is shorter than 16 characters; take a long random one")
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
@@ -106,6 +111,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         stage_root=root,
     )  # fmt: skip
 
+    webhooks = Webhooks(settings.key, settings.limits.webhooks)
+
     @contextlib.asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         jobs.start()
@@ -113,6 +120,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             yield
         finally:
             await jobs.stop()
+            await webhooks.stop()
             hold.release()
             if not settings.data:
                 shutil.rmtree(data, ignore_errors=True)
@@ -121,15 +129,17 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         title="refract", version=__version__, docs_url=None, redoc_url=None, lifespan=lifespan,
         description="Renders USD stages with glass in them.", redirect_slashes=False,
     )  # fmt: skip
+    app.state.webhooks = webhooks
     app.state.jobs, app.state.settings, app.state.metrics = jobs, settings, metrics
     entry = door(settings.host, settings.allow_hosts, settings.allow_origins)
-    app.add_middleware(Edge, door=entry, tokens=tokens_of(settings.tokens), metrics=metrics)
+    app.add_middleware(Edge, door=entry, tokens=tokens_of(settings.tokens), metrics=metrics, key=settings.key)
     app.add_middleware(Journal)
     if settings.proxies:  # around all others, so that the log too has the client
         app.add_middleware(ProxyHeadersMiddleware, trusted_hosts=list(settings.proxies))
     _add_handlers(app)
     _add_pages(app, settings, metrics)
     app.include_router(routes.router)
+    app.include_router(thumbnails.router)
     openapi.describe(app, tokens=bool(settings.tokens))
     app.mount("/static", _Static(directory=_STATIC), name="static")
     return app
@@ -192,7 +202,8 @@ def _add_handlers(app: FastAPI) -> None:
 
 def _methods_here(request: Request) -> list[str]:
     """Methods of a path. Starlette names those of the first route that fits, and a path may have several."""
-    known = [*request.app.routes, *routes.router.routes]  # FastAPI shows the second as one, which has no methods
+    ours = [*routes.router.routes, *thumbnails.router.routes]  # FastAPI shows a router as one, which has no methods
+    known = [*request.app.routes, *ours]
     fitting = [route for route in known if route.matches(request.scope)[0] is not Match.NONE]
     return sorted({method for route in fitting for method in getattr(route, "methods", None) or ()}) or ["GET"]
 

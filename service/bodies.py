@@ -22,12 +22,15 @@ from .limits import Limits
 from .models import StageOnly
 from .problems import Problem
 from .tasks import pointer
+from .uploads import ARCHIVE, GLTF, USD, check_together, checked_name, pack
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
-SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
-_MAGIC = {b"#usda ": ".usda", b"PXR-USDC": ".usdc", b"PK\x03\x04": ".usdz"}
+SUFFIXES = USD
+_MAGIC = {b"#usda ": ".usda", b"PXR-USDC": ".usdc", b"PK\x03\x04": ".usdz", b"glTF": ".glb"}
+_START = 64
+"""Bytes that tell what a file is."""
 
 
 class Wish(NamedTuple):
@@ -37,6 +40,8 @@ class Wish(NamedTuple):
     upload: Path | None
     """The uploaded stage in a temporary file, which the reader of this must move or remove."""
     suffix: str
+    inner: str = ""
+    """Of an upload of several files, the name of the one to open; '' leaves it to be found."""
 
 
 async def read_wish(request: Request, model: type[StageOnly], limits: Limits, folder: Path) -> Wish:
@@ -61,25 +66,30 @@ async def _read(request: Request, model: type[StageOnly], limits: Limits, folder
     if request.headers.get("content-encoding", "identity").lower() != "identity":
         raise Problem("unsupported-media-type", "send the body without Content-Encoding")
     if media == "application/json":
-        limited = _limited(request, limits.settings_bytes)
-        settings = check(model, parse(b"".join([part async for part in limited.stream()])))
+        stream = limited(request, limits.settings_bytes).stream()
+        settings = check(model, parse(b"".join([part async for part in stream])))
         if settings.stage is None:
             raise invalid("/stage", "is missing; name a stage of GET /v1/stages, or upload one as multipart/form-data")
         return Wish(settings, None, "")
-    return await _read_form(_limited(request, limits.body_bytes), model, limits, folder)
+    return await _read_form(limited(request, limits.body_bytes), model, limits, folder)
 
 
 async def _read_form(request: Request, model: type[StageOnly], limits: Limits, folder: Path) -> Wish:
     try:
-        form = await request.form(max_files=2, max_fields=4, max_part_size=limits.settings_bytes)
+        form = await request.form(
+            max_files=limits.upload_files + 1, max_fields=4, max_part_size=limits.settings_bytes
+        )  # fmt: skip
     except HTTPException as error:
+        if str(error.detail).startswith("Too many files"):
+            raise Problem("limit-exceeded", f"the upload has more than {limits.upload_files} files") from None
         raise Problem("bad-request", f"the multipart body cannot be read: {str(error.detail)[:200]}") from None
     try:
         parts = form.multi_items()
         for name, _ in parts:
-            if name not in ("stage", "settings"):
-                raise invalid(f"/{pointer(name[:100])}", "is no part of this request; send stage and settings")
-        if len({name for name, _ in parts}) != len(parts):
+            if name not in ("stage", "settings", "file"):
+                raise invalid(f"/{pointer(name[:100])}", "is no part of this request; send stage, file and settings")
+        single = [name for name, _ in parts if name != "file"]
+        if len(set(single)) != len(single):
             raise Problem("bad-request", "a part comes twice")
         text: Any = form.get("settings") or "{}"
         if isinstance(text, UploadFile):
@@ -87,18 +97,40 @@ async def _read_form(request: Request, model: type[StageOnly], limits: Limits, f
             if len(text) > limits.settings_bytes:
                 raise Problem("too-large", f"settings may have {limits.settings_bytes} bytes")
         settings = check(model, parse(text))
-        stage = form.get("stage")
-        if not isinstance(stage, UploadFile):
+        stage, files = form.get("stage"), form.getlist("file")
+        if not isinstance(stage, UploadFile | None) or not (stage or files):
             raise invalid("/stage", "is missing; upload a file under this name, or name a stage in a JSON body")
-        if settings.stage is not None:
-            raise invalid("/stage", "a file is uploaded already; leave it out of the settings")
-        suffix = _suffix(await stage.read(8))
-        await stage.seek(0)
         path = folder / f"upload-{secrets.token_hex(8)}"
-        await asyncio.to_thread(_store, stage, path, limits.stage_bytes)
-        return Wish(settings, path, suffix)
+        try:
+            return await _stored(settings, stage, files, limits, path)
+        except BaseException:
+            path.unlink(missing_ok=True)
+            raise
     finally:
         await form.close()
+
+
+async def _stored(
+    settings: StageOnly, stage: UploadFile | None, files: list[Any], limits: Limits, path: Path
+) -> Wish:  # fmt: skip
+    """Put the stage where it can be moved from: as it is, or with all files that belong to it in one archive."""
+    if stage and settings.stage is not None and (files or await _suffix_of(stage) != ARCHIVE):
+        raise invalid("/stage", "a file is uploaded already; leave it out of the settings")
+    if stage and not files:
+        suffix = await _suffix_of(stage)
+        await asyncio.to_thread(_store, stage, path, limits.stage_bytes)
+        return Wish(settings, path, suffix, settings.stage or "")
+    named = [(checked_name(one.filename or ""), one) for one in (stage, *files) if isinstance(one, UploadFile)]
+    if len(named) < len(files) + (stage is not None):
+        raise invalid("/file", "is no file; send each with its name relative to the upload")
+    check_together(name for name, _ in named)
+    if stage and not named[0][0].lower().endswith((*USD, *GLTF)):
+        raise Problem("unsupported-media-type", _SENDABLE)
+    total = sum(one.size or 0 for _, one in named)
+    if total > limits.stage_bytes:
+        raise Problem("too-large", f"the files have {total} bytes; the limit is {limits.stage_bytes}")
+    await asyncio.to_thread(pack, {name: one.file for name, one in named}, path)
+    return Wish(settings, path, ARCHIVE, named[0][0] if stage else settings.stage or "")
 
 
 def _store(stage: UploadFile, path: Path, most: int) -> None:
@@ -112,14 +144,31 @@ def _store(stage: UploadFile, path: Path, most: int) -> None:
         raise
 
 
-def _suffix(start: bytes) -> str:
+_SENDABLE = "the file is not USD; send .usda, .usdc, .usd, .usdz, .glb or .gltf, or a .zip with one of them"
+
+
+async def _suffix_of(stage: UploadFile) -> str:
+    start = await stage.read(_START)
+    await stage.seek(0)
+    return suffix_of(start, stage.filename or "")
+
+
+def suffix_of(start: bytes, name: str) -> str:
+    """What a file is, by how it begins; packages and other archives begin alike, and are told apart by their names.
+
+    Raises:
+        Problem: nothing that is read.
+    """
     for magic, suffix in _MAGIC.items():
         if start.startswith(magic):
-            return suffix
-    raise Problem("unsupported-media-type", "the file is not USD; send .usda, .usdc, .usd or .usdz")
+            zipped = suffix == ".usdz" and name.lower().endswith(ARCHIVE)
+            return ARCHIVE if zipped else suffix
+    if start.lstrip().startswith(b"{"):
+        return ".gltf"
+    raise Problem("unsupported-media-type", _SENDABLE)
 
 
-def _limited(request: Request, most: int) -> Request:
+def limited(request: Request, most: int) -> Request:
     """The same request, which raises as soon as it is known that the body is too large."""
     detail = f"the limit is {most} bytes"
     declared = request.headers.get("content-length", "")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import os
 from pathlib import Path
+from typing import Any
 
 import refract_core
 
@@ -26,6 +28,13 @@ def engine() -> str:
             digest.update(path.read_bytes())
         _ENGINE.append(f"{__version__}+{digest.hexdigest()[:12]}")
     return _ENGINE[0]
+
+
+def identifier_of(kind: str, settings: dict[str, Any], digest: str, owner: str = "") -> str:
+    """Name of a job: the same for the same work on the same stage by the same engine. Each owner has jobs of its own:
+    that somebody else has asked for the same is nobody's business."""
+    wish = json.dumps([kind, engine(), digest, settings, *([owner] if owner else [])], sort_keys=True, allow_nan=False)
+    return hashlib.sha256(wish.encode()).hexdigest()
 
 
 def file_digest(path: Path) -> str:

@@ -16,7 +16,8 @@ from .journal import request_id
 from .metrics import Metrics
 from .problems import MEDIA_TYPE, Problem, of_status, respond
 from .shares import Client, address_of
-from .tokens import Token, needed, token_in
+from .signing import expiry
+from .tokens import SIGNABLE, Token, needed, token_in
 
 _LINGER = 2.0
 """[s] A client that is still sending when it is refused would lose the answer if the connection closed at once."""
@@ -30,8 +31,10 @@ GUARDS = ((b"x-content-type-options", b"nosniff"), (b"referrer-policy", b"no-ref
 class Edge:
     """ASGI middleware."""
 
-    def __init__(self, app: ASGIApp, *, door: Door, tokens: Sequence[Token], metrics: Metrics) -> None:
-        self.app, self.door, self.tokens, self.metrics = app, door, tokens, metrics
+    def __init__(
+        self, app: ASGIApp, *, door: Door, tokens: Sequence[Token], metrics: Metrics, key: str = ""
+    ) -> None:  # fmt: skip
+        self.app, self.door, self.tokens, self.metrics, self.key = app, door, tokens, metrics, key
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -94,7 +97,7 @@ class Edge:
 
     def _refusal(self, scope: Scope, headers: Headers) -> Problem | None:
         wanted = needed(scope["method"], scope["path"])
-        if self.tokens and wanted:
+        if self.tokens and wanted and not self._signed(scope):
             token = token_in(headers.get("authorization", ""), self.tokens)
             if token is None:
                 return Problem("unauthorized", "this service asks for a bearer token")
@@ -109,6 +112,12 @@ class Edge:
         ):  # fmt: skip
             return Problem("cross-origin", "a page of another site may not ask for work here")
         return None
+
+    def _signed(self, scope: Scope) -> bool:
+        """An address that may be opened without a token."""
+        raw, query = (scope.get(part, b"").decode("latin-1") for part in ("raw_path", "query_string"))
+        reads = scope["method"] in ("GET", "HEAD") and scope["path"].startswith(SIGNABLE)
+        return reads and expiry(self.key, raw, query, time.time()) is not None
 
 
 def _misled(headers: Headers, door: Door) -> Problem | None:

@@ -27,7 +27,7 @@ EXPOSED = ("ETag", "Location", "Content-Location", "Content-Range", "Preference-
 """Headers of an answer that a page of another site may read."""
 _ASKED = ("Accept", "Authorization", "Content-Type", "If-None-Match", "If-Range", "Prefer", "Range", "X-Request-ID")
 """Headers that such a page may send."""
-_METHODS = "GET, HEAD, POST, DELETE"
+_METHODS = "GET, HEAD, POST, PUT, DELETE"
 _PREFLIGHT_SECONDS = 600
 """[s] A browser need not ask again for this long."""
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hashlib
-import json
 import logging
 import math
 import os
@@ -21,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from . import quota, reading
 from .bodies import own_stage
-from .digests import engine, file_digest, tree_digest
+from .digests import file_digest, identifier_of, tree_digest
 from .discreet import own_folders, without_folders
 from .limits import Limits
 from .metrics import Metrics
@@ -42,6 +40,13 @@ class _Plane(BaseModel):
     white: float
 
 
+class _Picture(BaseModel):
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+    width: int
+    height: int
+    time_code: float
+
+
 class _Done(BaseModel):
     """What a worker may say at its end. It has read a stranger's file, so it is not believed blindly."""
 
@@ -49,6 +54,7 @@ class _Done(BaseModel):
     width: int | None = None
     height: int | None = None
     aovs: list[_Plane] = []
+    pictures: list[_Picture] = []
 
 
 class Jobs:
@@ -130,15 +136,19 @@ class Jobs:
             if self.stage_root is None or own_stage(self.stage_root, record.stage) != record.stage:
                 return ""
             digest = tree_digest(self.stage_root, record.stage)
-        return _identity(record.kind, digest, record.settings, record.owner)
+        return identifier_of(record.kind, record.settings, digest, record.owner)
 
     # --- in ---------------------------------------------------------------------------------------------------------
+
+    def check_open(self) -> None:
+        """Raises Problem where nothing new is taken any more."""
+        if self.draining:
+            raise Problem("unavailable", "the service is about to stop", headers={"Retry-After": "10"})
 
     @contextlib.contextmanager
     def arriving(self, client: Client) -> Iterator[None]:
         """While a request's body arrives, which takes no place in the queue yet. Raises Problem."""
-        if self.draining:
-            raise Problem("unavailable", "the service is about to stop", headers={"Retry-After": "10"})
+        self.check_open()
         with self.shares.bodies.one(client, "bodies that may arrive"):
             yield
 
@@ -156,7 +166,7 @@ class Jobs:
         Raises:
             Problem: there is no place for another job, or not for this client.
         """
-        identifier = _identity(kind, digest, settings, client.owner)
+        identifier = identifier_of(kind, settings, digest, client.owner)
         known = self.records.get(identifier)
         if known and known.status in ("queued", "running", "done"):
             self.metrics.cached.inc()
@@ -310,9 +320,9 @@ class Jobs:
         self.metrics.worked.labels(record.kind).observe(seconds)
         if problem is None:
             self.store.take_results(work, record)
-            self._end(record, "done", None)
-        else:
-            self._end(record, "failed", problem)
+            if not (self.store.folder(record.id) / record.outcome()).is_file():
+                problem = self._fault(record, work, "the program said it was done, and made nothing")
+        self._end(record, "failed" if problem else "done", problem)
 
     async def _listen(self, record: Record, worker: Worker, work: Path) -> Problem | None:
         """Follow a worker to its end."""
@@ -346,11 +356,15 @@ class Jobs:
         """A worker's own words, with what only the server can know about them."""
         problem = _problem_of(message, self._discreet)
         if problem.slug == "worker-fault":
-            self.metrics.faults.inc()
-            log.error("job %s: a fault of this program\n%s", record.id, _last_words(work))
+            return self._fault(record, work, problem.detail)
         if problem.slug == "no-space" and self.store.free() > self.limits.result_bytes:
             return Problem("limit-exceeded", "the files of the job are larger than this service allows")
         return problem
+
+    def _fault(self, record: Record, work: Path, text: str) -> Problem:
+        self.metrics.faults.inc()
+        log.error("job %s: a fault of this program\n%s", record.id, _last_words(work))
+        return Problem("worker-fault", text)
 
     def _progress(self, record: Record, message: dict[str, Any]) -> None:
         if isinstance(message.get("progress"), int | float) and math.isfinite(message["progress"]):
@@ -435,12 +449,6 @@ def _problem_of(message: Any, discreet: Callable[[Any], str]) -> Problem:
         return Problem(message["slug"], discreet(message["detail"])[:1000], errors=errors[:20],
                        prim=discreet(message.get("prim") or "")[:1024])  # fmt: skip
     return Problem("stage-crashed", "the worker ended without an answer")
-
-
-def _identity(kind: str, digest: str, settings: dict[str, Any], owner: str) -> str:
-    # Each owner has jobs of its own: that somebody else has asked for the same is nobody's business.
-    wish = json.dumps([kind, engine(), digest, settings, *([owner] if owner else [])], sort_keys=True, allow_nan=False)
-    return hashlib.sha256(wish.encode()).hexdigest()
 
 
 def _last_words(work: Path) -> str:

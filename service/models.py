@@ -20,8 +20,16 @@ Aov = Literal[
 ]  # fmt: skip
 Path = Annotated[str, StringConstraints(min_length=1, max_length=1024, pattern=r"^[^\x00-\x1f\x7f]+$")]
 _Once = Field(json_schema_extra={"uniqueItems": True})
+Side = Annotated[int, Field(ge=1, le=1 << 28)]
+TimeCode = Annotated[float, Field(ge=-1e9, le=1e9)]
+Variant = Annotated[
+    str,
+    StringConstraints(max_length=1024, pattern=r"^[^\x00-\x1f\x7f{}=]*\{[^\x00-\x1f\x7f{}=]+=[^\x00-\x1f\x7f{}=]+\}$"),
+    Field(description="`/Prim{set=name}`; without a path it is of the default prim"),
+]
 Unit = Annotated[float, Field(ge=0.0, le=1.0)]
 Length = Annotated[float, Field(gt=0.0, le=1e9, description="in the stage's own units")]
+Address = Annotated[str, StringConstraints(min_length=8, max_length=2048, pattern="^https?://[!-~]+$")]
 
 
 class Strict(BaseModel):
@@ -42,7 +50,13 @@ class Override(Strict):
 class StageOnly(Strict):
     """`POST /v1/inspect`, `/v1/validate`."""
 
-    stage: Path | None = Field(None, description="a stage of GET /v1/stages; leave it out when a file is uploaded")
+    stage: Path | None = Field(None, description=(
+        "a stage of GET /v1/stages; of an upload of several files, the one to open; leave it out when one file is "
+        "uploaded"
+    ))  # fmt: skip
+    webhook: Address | None = Field(
+        None, description="address that is told when the job has ended, by a signed POST of the job"
+    )
 
 
 class Render(StageOnly):
@@ -65,7 +79,17 @@ class Render(StageOnly):
     exposure: Annotated[float, Field(ge=-64.0, le=64.0)] | None = None
     camera_light: bool | None = None
     purposes: Annotated[list[Purpose], Field(min_length=1, max_length=4), _Once] | None = None
-    time_code: Annotated[float, Field(ge=-1e9, le=1e9)] | None = None
+    time_code: TimeCode | None = None
+    widths: Annotated[list[Side], Field(min_length=1, max_length=64), _Once] | None = Field(
+        None, description="a picture of each width [pixels], in place of image_width and image_height"
+    )
+    time_codes: Annotated[list[TimeCode], Field(min_length=1, max_length=4096), _Once] | None = Field(
+        None, description="a picture of each time code, in place of time_code"
+    )
+    variants: Annotated[list[Variant], Field(max_length=64), _Once] | None = None
+    format: Literal["png", "jpeg", "webp", "avif", "exr"] | None = Field(
+        None, description="of the picture; left out, the header Accept chooses"
+    )
     aovs: Annotated[list[Aov], Field(max_length=17), _Once] | None = None
     color_correction: Literal["disabled", "sRGB", "openColorIO"] | None = None
     overrides: Annotated[dict[Path, Override], Field(max_length=256)] | None = None
@@ -91,6 +115,13 @@ class AovPicture(BaseModel):
     name: str
     href: str
     white: float = Field(description="value of a white pixel; black is 0")
+
+
+class Picture(BaseModel):
+    href: str
+    width: int
+    height: int
+    time_code: float
 
 
 class FieldProblem(BaseModel):
@@ -126,6 +157,7 @@ class Job(BaseModel):
     width: int | None
     height: int | None
     aovs: list[AovPicture]
+    pictures: list[Picture] = Field(description="where there are several")
     problem: ProblemDocument | None
     links: dict[str, str]
 

@@ -8,7 +8,7 @@ from typing import Any, get_args
 from fastapi import FastAPI
 
 from . import models
-from .problems import KINDS, MEDIA_TYPE
+from .problems import KINDS, MEDIA_TYPE, Problem
 from .tokens import needed
 
 Answers = dict[int | str, dict[str, Any]]
@@ -40,8 +40,26 @@ _RESULT_HEADERS = {
     "Cache-Control": _header("a result never changes"),
     "Vary": _header("Accept, which chooses the format"),
 }
+_TAGS = (
+    ("work", ("/v1/render", "/v1/convert", "/v1/inspect", "/v1/validate"), "what is done with a stage"),
+    ("jobs", ("/v1/jobs",), "how a job is doing, and what it made"),
+    ("thumbnails", ("/v1/thumbnails", "/v1/stages/"), "pictures with an address, and the stages sent for them"),
+    ("service", ("/",), "the service itself"),
+)
+"""Tag, how the paths that have it begin (the first that fits counts), and what it means."""
+_EXAMPLES: dict[str, dict[str, Any]] = {
+    "as it is": {"stage": "marble.usda"},
+    "small and quick": {"stage": "marble.usda", "image_width": 320, "samples": 1},
+    "sizes for a shop": {"stage": "marble.usda", "widths": [64, 256, 1024], "format": "webp"},
+    "another glass": {"stage": "marble.usda", "overrides": {"/World/Looks/Amber": {"ior": 1.33}}},
+    "for glTF": {"stage": "preview_surface.usda", "to": "gltf", "thickness": "measured"},
+}
+"""Bodies, each for the requests that have these fields."""
 _PATHS: dict[str, Any] = {
     "identifier": {"type": "string", "pattern": "^[0-9a-f]{64}$"},
+    "digest": {"type": "string", "pattern": "^[0-9a-f]{64}$"},
+    "stage": {"type": "string", "minLength": 1},
+    "number": {"type": "integer", "minimum": 0, "maximum": 9999},
     "name": {"type": "string", "enum": [name for name in get_args(models.Aov) if name != "P"]},
 }
 """What a part of a path may be; anything else is a 404."""
@@ -60,12 +78,18 @@ _CONDITIONS = [
 ]
 
 
+def _problem(status: int) -> dict[str, Any]:
+    """A problem document, and one of this status."""
+    slug = next(slug for slug, kind in KINDS.items() if kind.status == status)
+    return {"schema": _PROBLEM, "example": Problem(slug, KINDS[slug].about).document()}
+
+
 def problems(*statuses: int) -> Answers:
     """Answers that are problem documents."""
     return {
         status: {
             "description": " or ".join(sorted({kind.title for kind in KINDS.values() if kind.status == status})),
-            "content": {MEDIA_TYPE: {"schema": _PROBLEM}}, "headers": _HEADERS_OF.get(status, {}),
+            "content": {MEDIA_TYPE: _problem(status)}, "headers": _HEADERS_OF.get(status, {}),
         }
         for status in statuses
     }  # fmt: skip
@@ -104,6 +128,31 @@ def result(what: str, *media: str) -> dict[str, Any]:
     return {"openapi_extra": {"parameters": _CONDITIONS}, "responses": answers}
 
 
+def stage_by_digest() -> dict[str, Any]:
+    """Keywords for the route that keeps a stage."""
+    body = {"required": True, "content": {
+        media: {"schema": {"type": "string", "format": "binary"}}
+        for media in ("application/octet-stream", "application/zip")
+    }}  # fmt: skip
+    made = {"description": "the stage is kept", "headers": {"Location": _header("its thumbnail")}}
+    there = {"description": "it was there already"}
+    refusals = problems(403, 404, 408, 413, 415, 422, 429, 503)
+    return {"openapi_extra": {"requestBody": body}, "responses": {201: made, 204: there, **refusals}}
+
+
+def thumbnail(query: dict[str, tuple[str, dict[str, Any]]], media: Iterable[str]) -> dict[str, Any]:
+    """Keywords for the route of thumbnails.
+
+    Args:
+        query: name of a parameter -> description and schema.
+    """
+    asked = [{"name": name, "in": "query", "required": False, "description": text, "schema": schema}
+             for name, (text, schema) in query.items()]  # fmt: skip
+    found = result("the picture", *media)
+    return {"openapi_extra": {"parameters": [*asked, *_CONDITIONS]},
+            "responses": {**found["responses"], **problems(*WORK)}}  # fmt: skip
+
+
 def _body(model: type[models.StageOnly]) -> dict[str, Any]:
     """A stage of ours by its name in JSON, or an uploaded one with settings beside it."""
     schema = _inlined(model)
@@ -112,12 +161,25 @@ def _body(model: type[models.StageOnly]) -> dict[str, Any]:
     ours = {**schema, "required": ["stage"], "properties": {
         "stage": {**named, "title": "Stage", "description": "a stage of GET /v1/stages"}, **schema["properties"],
     }}  # fmt: skip
-    settings = {"type": "string", "contentMediaType": "application/json", "contentSchema": schema}
+    told = {**schema, "properties": {
+        "stage": {**named, "title": "Stage", "description": "of an upload of several files, the one to open"},
+        **schema["properties"],
+    }}  # fmt: skip
+    settings = {"type": "string", "contentMediaType": "application/json", "contentSchema": told}
+    one = {"type": "string", "format": "binary"}
     form = {
-        "type": "object", "required": ["stage"], "additionalProperties": False,
-        "properties": {"stage": {"type": "string", "format": "binary"}, "settings": settings},
+        "type": "object", "additionalProperties": False, "anyOf": [{"required": ["stage"]}, {"required": ["file"]}],
+        "properties": {
+            "stage": {**one, "description": "USD, glTF, or a .zip with a stage and all that belongs to it"},
+            "file": {"type": "array", "items": one, "minItems": 1, "description": (
+                "a file that the stage refers to, under its relative name; of several, one may be the stage"
+            )},
+            "settings": settings,
+        },
     }  # fmt: skip
-    content = {"application/json": {"schema": ours}, "multipart/form-data": {"schema": form}}
+    fitting = {name: value for name, value in _EXAMPLES.items() if value.keys() <= model.model_fields.keys()}
+    examples = {name: {"value": value} for name, value in fitting.items()}
+    content = {"application/json": {"schema": ours, "examples": examples}, "multipart/form-data": {"schema": form}}
     return {"required": True, "content": content}
 
 
@@ -169,8 +231,11 @@ def _completed(found: dict[str, Any], tokens: bool) -> dict[str, Any]:
     for path, operations in found["paths"].items():
         for method, operation in operations.items():
             _complete(operation, needed(method.upper(), path) if tokens else "")
+            operation["tags"] = [next(tag for tag, starts, _ in _TAGS if path.startswith(starts))]
     numbers = found["paths"]["/metrics"]["get"]["responses"]["200"]
     numbers["content"] = {"text/plain": {"schema": {"type": "string"}}}
+    found["tags"] = [{"name": tag, "description": text} for tag, _, text in _TAGS]
+    found["servers"] = [{"url": "/", "description": "where this document comes from"}]
     parts = found.setdefault("components", {})
     for name in ("HTTPValidationError", "ValidationError"):  # FastAPI's own, which nobody is ever sent
         parts.get("schemas", {}).pop(name, None)
@@ -194,7 +259,7 @@ def _complete(operation: dict[str, Any], scope: str) -> None:
     for status, answer in answers.items():
         answer["headers"] = {**_HEADERS_OF.get(int(status), {}), **answer.get("headers", {}), **_REQUEST_ID}
         if MEDIA_TYPE in answer.get("content", {}):
-            answer["content"][MEDIA_TYPE] = {"schema": _PROBLEM}
+            answer["content"][MEDIA_TYPE] = _problem(int(status))
     operation["responses"] = dict(sorted(answers.items()))
 
 

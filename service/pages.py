@@ -45,7 +45,7 @@ def docs_page(document: dict[str, Any], limits: Limits) -> str:
             parts.append(f"<h2><code>{method.upper()} {escape(path)}</code></h2>")
             parts.append(f"<p>{escape(one.get('description') or one.get('summary', ''))}</p>")
             for header in one.get("parameters", ()):
-                if header["in"] == "header":
+                if header["in"] in ("header", "query"):
                     parts.append(f"<p><code>{escape(header['name'])}</code>: {escape(header['description'])}</p>")
             done = {code: text for code, text in one["responses"].items() if code < "4"}
             answers = ", ".join(f"{code} {escape(text['description'])}" for code, text in done.items())

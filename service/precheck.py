@@ -19,6 +19,9 @@ from refract_core.errors import StageError
 from refract_core.usd.diagnostics import captured
 from refract_core.usd.prim_count import count_prims
 
+from .gltf_parts import parts_of
+from .uploads import GLTF
+
 _LAYERS = (".usd", ".usda", ".usdc", ".usdz")
 _OPINIONS = 8
 """Specs a prim may be put together from, on average: what composing costs where few prims refer to much."""
@@ -104,6 +107,8 @@ def _names(place: Place, held: list[Sdf.Layer]) -> list[tuple[str, bool]]:
     is added to `held`."""
     if not place.inner and not os.path.isfile(place.file):
         return []
+    if not place.inner and place.file.lower().endswith(GLTF):
+        return [(name, False) for name in parts_of(place.file)]
     if not (place.inner or place.file).lower().endswith(_LAYERS):
         return []
     with captured():

@@ -31,14 +31,15 @@ KINDS: dict[str, Kind] = {
     "cancelled": Kind(409, "The job was cancelled", "Send the request again to start anew."),
     "too-large": Kind(413, "The body is too large", "See /v1/limits."),
     "range-not-satisfiable": Kind(416, "The result does not reach that far", "Content-Range tells its size in bytes."),
-    "unsupported-media-type": Kind(415, "The body is of a type that is not read", "Send JSON, or multipart with USD."),
+    "unsupported-media-type": Kind(415, "The body is of a type that is not read",
+                                   "Send JSON, or multipart with USD or glTF."),
     "misdirected": Kind(421, "The service does not go by this name",
                         "Ask by `localhost`, by the address it listens on, or by a name given with `--allow-host`."),
     "invalid-settings": Kind(422, "The settings are not valid", "`errors` names each field by a JSON pointer."),
     "stage-invalid": Kind(422, "The stage cannot be read", "Try `refract validate` on it."),
     "stage-refused": Kind(422, "The stage refers to something outside itself",
-                          "Upload a self-contained stage, such as a .usdz; absolute paths, `..`, links and expressions "
-                          "are refused."),
+                          "Upload a self-contained stage, such as a .usdz, or all its files; absolute paths, links, "
+                          "expressions, and `..` out of what was sent are refused."),
     "limit-exceeded": Kind(422, "The job is larger than this service allows", "See /v1/limits."),
     "time-limit": Kind(422, "The job took too long", "Ask for fewer pixels or samples, or a simpler stage."),
     "memory-limit": Kind(422, "The job needed too much memory", "Ask for fewer pixels, or a simpler stage."),

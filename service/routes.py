@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from collections.abc import AsyncIterator, Mapping
+import re
+from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,28 +16,36 @@ from starlette.responses import FileResponse, JSONResponse, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from . import models, openapi
-from .bodies import own_stage, read_wish, stages
+from .bodies import invalid, own_stage, read_wish, stages
 from .digests import file_digest, tree_digest
+from .formats import FORMATS, MEDIA, accepted, chosen, format_of
 from .jobs import Jobs
 from .limits import table
 from .openapi import problems
 from .problems import Problem, document_response
 from .shares import Client
-from .store import RESULTS, Record
+from .store import RESULTS, Record, count_of
+from .webhooks import Webhooks
 
 router = APIRouter(prefix="/v1")
 _KEEP_ALIVE = 15.0  # [s] between comments in a quiet stream of events
-_TYPES = {".png": "image/png", ".exr": "image/x-exr", ".json": "application/json", ".usdz": "model/vnd.usdz+zip"}
+_ZIP = "application/zip"
+_TYPES = {
+    **{f".{one.extension}": one.media for one in FORMATS.values()}, ".json": "application/json",
+    ".usdz": "model/vnd.usdz+zip", ".zip": _ZIP,
+}  # fmt: skip
+Ask = Callable[[dict[str, Any], str], str]
+"""Completes the settings of a job by the header Accept, and returns the media type of the answer."""
 _OBJECT: dict[str, Any] = {"type": "object"}
 _CONVERTED = {"type": "object", "required": ["stage", "out", "materials", "notices"]}
 
 
-def _jobs(request: Request) -> Jobs:
+def jobs_of(request: Request) -> Jobs:
     jobs: Jobs = request.app.state.jobs
     return jobs
 
 
-def _client(request: Request) -> Client:
+def client_of(request: Request) -> Client:
     client: Client = request.state.client
     return client
 
@@ -45,12 +54,26 @@ def _client(request: Request) -> Client:
 
 
 @router.post("/render", response_class=Response, **openapi.work(
-    models.Render, "the picture", {"image/png": {}, "image/x-exr": {}}
+    models.Render, "the picture, or several of them in one archive", {media: {} for media in (*MEDIA, _ZIP)}
 ))  # fmt: skip
 async def render(request: Request) -> Response:
-    """Render a stage. Answers with the picture; `Accept` chooses image/png or image/x-exr."""
-    media = _chosen(request, ("image/png", "image/x-exr"))
-    return await _work(request, "render", {"format": "exr" if media == "image/x-exr" else "png"}, media)
+    """Render a stage. Answers with the picture; `Accept`, or `format` in the settings, chooses its format. Several
+    `widths` or `time_codes` make several pictures, which come as one .zip, or one by one from the job."""
+    chosen(request.headers.get("accept", ""), (*MEDIA, _ZIP))
+    return await _work(request, "render", _ask_for_pictures)
+
+
+def _ask_for_pictures(settings: dict[str, Any], accept: str) -> str:
+    """Put the file's extension in place of the format's name. Returns the media type of the answer."""
+    several = count_of(settings) > 1
+    asked = settings.get("format", "")
+    if several and not asked and not accepted(accept, MEDIA):
+        asked = "png"
+    name = format_of("" if several and not accepted(accept, MEDIA) else accept, asked)
+    settings["format"] = FORMATS[name].extension
+    if several and settings.get("aovs") and name != "exr":
+        raise invalid("/aovs", "of several pictures are held by EXR alone; set format to exr, or ask for one picture")
+    return _ZIP if several else FORMATS[name].media
 
 
 @router.post("/convert", response_class=Response, **openapi.work(
@@ -59,7 +82,7 @@ async def render(request: Request) -> Response:
 ))  # fmt: skip
 async def convert(request: Request) -> Response:
     """Find the glass of a stage and describe it with RefractMaterialAPI, as `refract convert`."""
-    return await _work(request, "convert", {}, _chosen(request, ("model/vnd.usdz+zip", "application/json")))
+    return await _work(request, "convert", _given(request, "model/vnd.usdz+zip", "application/json"))
 
 
 @router.post("/inspect", response_class=Response, **openapi.work(
@@ -67,7 +90,7 @@ async def convert(request: Request) -> Response:
 ))  # fmt: skip
 async def inspect(request: Request) -> Response:
     """What is in a stage, as `refract inspect --json`."""
-    return await _work(request, "inspect", {}, _chosen(request, ("application/json",)))
+    return await _work(request, "inspect", _given(request, "application/json"))
 
 
 @router.post("/validate", response_class=Response, **openapi.work(
@@ -75,49 +98,48 @@ async def inspect(request: Request) -> Response:
 ))  # fmt: skip
 async def validate(request: Request) -> Response:
     """What is wrong with a stage, as `refract validate --json`."""
-    return await _work(request, "validate", {}, _chosen(request, ("application/json",)))
+    return await _work(request, "validate", _given(request, "application/json"))
 
 
-def _chosen(request: Request, known: tuple[str, ...]) -> str:
-    """The first of the known types that the client accepts, by its order of q values."""
-    header = request.headers.get("accept") or "*/*"
-    best, found = 0.0, ""
-    for part in header.split(","):
-        media, *parameters = (word.strip().lower() for word in part.split(";"))
-        weight = 1.0
-        for parameter in parameters:
-            if parameter.startswith("q="):
-                with contextlib.suppress(ValueError):
-                    weight = float(parameter[2:])
-        for one in known:
-            if weight > best and media in (one, "*/*", f"{one.partition('/')[0]}/*", one.replace("/x-", "/")):
-                best, found = weight, one
-                break
-    if not found:
-        raise Problem("not-acceptable", f"this can be given as {' or '.join(known)}")
-    return found
+def _given(request: Request, *known: str) -> Ask:
+    """An answer of one of these types, whatever the settings. Raises Problem where none is accepted."""
+    media = chosen(request.headers.get("accept", ""), known)
+    return lambda _settings, _accept: media
 
 
-async def _work(request: Request, kind: str, extra: dict[str, Any], media: str) -> Response:
-    jobs = _jobs(request)
-    with jobs.arriving(_client(request)):
-        record = await _submit(request, kind, extra, jobs)
+async def _work(request: Request, kind: str, ask: Ask) -> Response:
+    jobs = jobs_of(request)
+    with jobs.arriving(client_of(request)):
+        record, media = await _submit(request, kind, ask, jobs)
     if "respond-async" in request.headers.get("prefer", "").lower():
         jobs.keep(record)
         headers = {"Location": f"/v1/jobs/{record.id}", "Preference-Applied": "respond-async"}
         return JSONResponse(record.document(), 202, headers)
+    name = record.outcome(report=media == "application/json")
+    return await finished(request, jobs, record) or result(request, jobs, record, name)
+
+
+async def finished(request: Request, jobs: Jobs, record: Record) -> Response | None:
+    """Wait for a job. Returns None when it is done, and else the answer."""
     if not await _done_or_gone(request, jobs, record):
         return Response(status_code=499)
     if record.problem:
         return document_response(record.problem, {"Content-Location": f"/v1/jobs/{record.id}"})
-    return _result(request, jobs, record, _file_of(record, media))
+    return None
 
 
-async def _submit(request: Request, kind: str, extra: dict[str, Any], jobs: Jobs) -> Record:
+async def _submit(request: Request, kind: str, ask: Ask, jobs: Jobs) -> tuple[Record, str]:
+    """The job of a request, and the media type of its answer."""
     wish = await read_wish(request, models.KINDS[kind], jobs.limits, jobs.store.work)
     try:
-        settings = {**wish.settings.model_dump(exclude_none=True, exclude={"stage"}), **extra}
-        _check_limits(settings, jobs)
+        settings = wish.settings.model_dump(exclude_none=True, exclude={"stage", "webhook"})
+        media = ask(settings, request.headers.get("accept", ""))
+        if wish.inner:
+            settings["stage"] = wish.inner
+        check_limits(settings, jobs)
+        hook: Webhooks = request.app.state.webhooks
+        if wish.settings.webhook:
+            await hook.check(wish.settings.webhook)
         if wish.upload:
             digest, stage = await asyncio.to_thread(file_digest, wish.upload), f"stage{wish.suffix}"
         else:
@@ -125,7 +147,11 @@ async def _submit(request: Request, kind: str, extra: dict[str, Any], jobs: Jobs
             stage = own_stage(jobs.stage_root, wish.settings.stage)
             assert jobs.stage_root is not None
             digest = await asyncio.to_thread(tree_digest, jobs.stage_root, stage)
-        return jobs.submit(kind, settings, digest, stage, wish.upload, _client(request))
+        record = jobs.submit(kind, settings, digest, stage, wish.upload, client_of(request))
+        if wish.settings.webhook:
+            jobs.keep(record)
+            hook.follow(jobs, record, wish.settings.webhook)
+        return record, media
     finally:
         if wish.upload:
             wish.upload.unlink(missing_ok=True)
@@ -137,22 +163,29 @@ def _within(name: str, value: int, where: str, limits: Mapping[str, int]) -> Non
         raise Problem("limit-exceeded", text, errors=[{"pointer": where, "detail": text}])
 
 
-def _check_limits(settings: dict[str, Any], jobs: Jobs) -> None:
+def check_limits(settings: dict[str, Any], jobs: Jobs) -> None:
     """What can be told before the stage is read; its worker looks again at what follows from the stage."""
     limits = asdict(jobs.limits)
-    width, height, samples = (settings.get(name) or 1 for name in ("image_width", "image_height", "samples"))
+    height, samples = (settings.get(name) or 1 for name in ("image_height", "samples"))
+    wide = max(settings.get("widths", (settings.get("image_width") or 1,)))
+    count, width = count_of(settings), "/widths" if "widths" in settings else "/image_width"
     asked = {
-        "pixels": (width * height, "/image_width"), "samples": (samples, "/samples"),
-        "pixel_samples": (width * height * samples, "/samples"), "aovs": (len(settings.get("aovs", ())), "/aovs"),
+        "pictures": (count, "/time_codes" if "time_codes" in settings else "/widths"),
+        "pixels": (wide * height, width), "samples": (samples, "/samples"),
+        "pixel_samples": (wide * height * samples, "/samples"), "aovs": (len(settings.get("aovs", ())), "/aovs"),
     }  # fmt: skip
-    for side in ("image_width", "image_height"):
-        _within("side", settings.get(side) or 1, f"/{side}", limits)
+    _within("side", wide, width, limits)
+    _within("side", height, "/image_height", limits)
     for name, (value, where) in asked.items():
         _within(name, value, where, limits)
-    for name in ("tiers", "purposes", "aovs"):
+    for name in ("tiers", "purposes", "aovs", "widths", "time_codes", "variants"):
         if len(set(settings.get(name, ()))) != len(settings.get(name, ())):
             raise Problem("invalid-settings", f"{name} names something twice",
                           errors=[{"pointer": f"/{name}", "detail": "names something twice"}])  # fmt: skip
+    for one, others in (("widths", ("image_width", "image_height")), ("time_codes", ("time_code",))):
+        for other in others:
+            if one in settings and other in settings:
+                raise invalid(f"/{other}", f"says the same as {one}; leave one of them out")
 
 
 async def _done_or_gone(request: Request, jobs: Jobs, record: Record) -> bool:
@@ -177,8 +210,8 @@ async def _done_or_gone(request: Request, jobs: Jobs, record: Record) -> bool:
 
 
 def _known(request: Request, identifier: str) -> Record:
-    record = _jobs(request).records.get(identifier)
-    if record is None or record.owner != _client(request).owner:
+    record = jobs_of(request).records.get(identifier)
+    if record is None or record.owner != client_of(request).owner:
         raise Problem("not-found", "there is no such job; it may have been removed")
     return record
 
@@ -193,7 +226,7 @@ async def job(request: Request, identifier: str) -> Response:
 async def cancel(request: Request, identifier: str) -> Response:
     """Cancel a job: its process is killed. A job that has ended stays as it is."""
     record = _known(request, identifier)
-    await _jobs(request).cancel(record)
+    await jobs_of(request).cancel(record)
     return JSONResponse(record.document())
 
 
@@ -202,9 +235,9 @@ async def cancel(request: Request, identifier: str) -> Response:
 })  # fmt: skip
 async def events(request: Request, identifier: str) -> StreamingResponse:
     """Progress as server-sent events: `progress`, then one of `done`, `failed`, `cancelled`; data is the job."""
-    record, jobs = _known(request, identifier), _jobs(request)
+    record, jobs = _known(request, identifier), jobs_of(request)
     held = contextlib.ExitStack()
-    held.enter_context(jobs.shares.streams.one(_client(request), "streams of events"))
+    held.enter_context(jobs.shares.streams.one(client_of(request), "streams of events"))
 
     async def stream() -> AsyncIterator[str]:
         while True:
@@ -233,13 +266,7 @@ class _Held(StreamingResponse):
             await super().__call__(scope, receive, send)
 
 
-def _file_of(record: Record, media: str = "") -> str:
-    if record.kind == "render":
-        return f"image.{record.settings['format']}"
-    return "converted.usdz" if record.kind == "convert" and media != "application/json" else "report.json"
-
-
-def _result(request: Request, jobs: Jobs, record: Record, name: str) -> Response:
+def result(request: Request, jobs: Jobs, record: Record, name: str) -> Response:
     """One file of a job, or 304."""
     if record.problem:
         problem = Problem("not-done", f"the job is {record.status}")
@@ -259,31 +286,52 @@ def _result(request: Request, jobs: Jobs, record: Record, name: str) -> Response
 
 
 @router.get("/jobs/{identifier}/image", response_class=Response,
-            **openapi.result("the picture", "image/png", "image/x-exr"))  # fmt: skip
+            **openapi.result("the picture", *MEDIA))  # fmt: skip
 async def image(request: Request, identifier: str) -> Response:
-    """The picture of a render."""
+    """The picture of a render, the first one where there are several."""
+    return _picture(request, identifier, 0)
+
+
+@router.get("/jobs/{identifier}/pictures", response_class=Response, **openapi.result("the pictures", _ZIP))
+async def pictures(request: Request, identifier: str) -> Response:
+    """All pictures of a render that makes several, as one archive."""
     record = _known(request, identifier)
-    if record.kind != "render":
-        raise Problem("not-found", "the job makes no picture")
-    return _result(request, _jobs(request), record, _file_of(record))
+    if record.kind != "render" or count_of(record.settings) < 2:
+        raise Problem("not-found", "the job does not make several pictures")
+    return result(request, jobs_of(request), record, record.outcome())
+
+
+@router.get("/jobs/{identifier}/pictures/{number}", response_class=Response,
+            **openapi.result("the picture", *MEDIA))  # fmt: skip
+async def picture(request: Request, identifier: str, number: str) -> Response:
+    """One picture of a render that makes several: its place in `pictures` of the job."""
+    return _picture(request, identifier, int(number) if re.fullmatch("[0-9]{1,4}", number) else -1)
+
+
+def _picture(request: Request, identifier: str, number: int) -> Response:
+    record = _known(request, identifier)
+    if record.kind != "render" or not 0 <= number < count_of(record.settings):
+        raise Problem("not-found", "the job makes no such picture")
+    name = f"picture.{number}" if count_of(record.settings) > 1 else "image"
+    return result(request, jobs_of(request), record, f"{name}.{record.settings['format']}")
 
 
 @router.get("/jobs/{identifier}/aovs/{name}.png", response_class=Response, **openapi.result("the picture", "image/png"))
 async def aov(request: Request, identifier: str, name: str) -> Response:
     """One AOV of a render that asked for it, as 8-bit grey or colour; the job says what white is."""
-    return _result(request, _jobs(request), _known(request, identifier), f"aov.{name}.png")
+    return result(request, jobs_of(request), _known(request, identifier), f"aov.{name}.png")
 
 
 @router.get("/jobs/{identifier}/file", response_class=Response, **openapi.result("the stage", "model/vnd.usdz+zip"))
 async def converted(request: Request, identifier: str) -> Response:
     """The stage that a conversion made."""
-    return _result(request, _jobs(request), _known(request, identifier), "converted.usdz")
+    return result(request, jobs_of(request), _known(request, identifier), "converted.usdz")
 
 
 @router.get("/jobs/{identifier}/report", response_class=Response, **openapi.result("the report", "application/json"))
 async def report(request: Request, identifier: str) -> Response:
     """What a conversion, inspection or validation found."""
-    return _result(request, _jobs(request), _known(request, identifier), "report.json")
+    return result(request, jobs_of(request), _known(request, identifier), "report.json")
 
 
 # --- about the service ------------------------------------------------------------------------------------------------
@@ -292,13 +340,13 @@ async def report(request: Request, identifier: str) -> Response:
 @router.get("/stages", response_model=models.Stages)
 async def own_stages(request: Request) -> dict[str, list[dict[str, Any]]]:
     """Stages that a request may name."""
-    return {"stages": await asyncio.to_thread(stages, _jobs(request).stage_root)}
+    return {"stages": await asyncio.to_thread(stages, jobs_of(request).stage_root)}
 
 
 @router.get("/limits", response_model=models.LimitTable)
 async def show_limits(request: Request) -> dict[str, Any]:
     """Every limit, and what confines workers on this machine."""
-    jobs = _jobs(request)
+    jobs = jobs_of(request)
     return {
         "limits": table(jobs.limits), "workers": jobs.workers, "queue": jobs.places - jobs.workers,
         "confinement": jobs.source.report,

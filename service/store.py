@@ -11,6 +11,7 @@ import shutil
 import stat
 import tempfile
 import time
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,7 +21,10 @@ from . import quota
 from .problems import Problem
 
 ENDED = ("done", "failed", "cancelled")
-RESULTS = re.compile(r"^(image\.(png|exr)|aov\.[A-Za-z_.]+\.png|report\.json|converted\.usdz)$")
+RESULTS = re.compile(
+    r"^((image|picture\.\d{1,4})\.(png|jpg|webp|avif|exr)|pictures\.zip|aov\.[A-Za-z_.]+\.png|report\.json|"
+    r"converted\.usdz)$"
+)
 _ID = re.compile(r"^[0-9a-f]{64}$")
 _FORGOTTEN = 3600.0  # [s]
 _FILES_OF_JOB, _BYTES_OF_JOB = 32, 1 << 20
@@ -30,6 +34,11 @@ _WORK = re.compile(r"^[0-9a-f]{16}$")
 
 def now() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+def count_of(settings: Mapping[str, Any]) -> int:
+    """How many pictures a render makes."""
+    return len(settings.get("widths") or (0,)) * len(settings.get("time_codes") or (0,))
 
 
 @dataclass
@@ -60,6 +69,12 @@ class Record:
     def ended(self) -> bool:
         return self.status in ENDED
 
+    def outcome(self, *, report: bool = False) -> str:
+        """The file that the job is done for, or its report where it makes one, too."""
+        if self.kind == "render":
+            return "pictures.zip" if count_of(self.settings) > 1 else f"image.{self.settings['format']}"
+        return "converted.usdz" if self.kind == "convert" and not report else "report.json"
+
     def document(self) -> dict[str, Any]:
         """As `models.Job`."""
         here = f"/v1/jobs/{self.id}"
@@ -68,11 +83,15 @@ class Record:
             links |= {"render": {"image": f"{here}/image"}, "convert": {"file": f"{here}/file",
                       "report": f"{here}/report"}}.get(self.kind, {"report": f"{here}/report"})  # fmt: skip
         aovs = [{**aov, "href": f"{here}/aovs/{aov['name']}.png"} for aov in self.result.get("aovs", [])]
+        several = self.result.get("pictures", [])
+        pictures = [{**one, "href": f"{here}/pictures/{number}"} for number, one in enumerate(several)]
+        if pictures and self.status == "done":
+            links["pictures"] = f"{here}/pictures"
         kept = ("id", "kind", "status", "fraction", "stage_of_work", "created", "started", "finished", "warnings",
                 "problem")  # fmt: skip
         return {
             **{name: getattr(self, name) for name in kept}, "width": self.result.get("width"),
-            "height": self.result.get("height"), "aovs": aovs, "links": links,
+            "height": self.result.get("height"), "aovs": aovs, "pictures": pictures, "links": links,
         }  # fmt: skip
 
 

@@ -5,9 +5,11 @@ Texts that leave are made for strangers: no path of this machine, and no line of
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
+import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from typing import Any
@@ -16,10 +18,11 @@ import numpy as np
 
 from refract_core.errors import EmbreeError, ImageError, RefractError, SceneError, StageError, UsageError
 from refract_core.images.aovs import AOVS
+from refract_core.images.frame import Frame
 from refract_core.scene import Notice, Scene
 from refract_core.verbs.override import OverrideError, Overrides, override, override_notes
 
-from . import reading
+from . import formats, reading, uploads
 from .discreet import own_folders, own_places, without_folders
 from .problems import Problem
 
@@ -31,11 +34,31 @@ _QUOTES = (
     r"\S*pxrInternal.*"
 )
 """Where USD's messages begin to quote files, or its own source."""
+_PARSED = re.compile(r":(?P<line>\d{1,9}):(?P<column>\d{1,9}): (?:Expected (?P<wanted>[!-~]{1,20}) at ')?")
+"""Where USD's parser stopped, and what it waited for: words of its grammar, before those of the file."""
+_CUT_OFF = "the package has no directory at its end, so it was cut off"
 _UNITS = ("Z", "thickness", "path_length", "layers")
 """Planes that are not between 0 and 1: their PNG is scaled, and says by how much."""
 _SETTINGS = ("camera", "image_width", "image_height", "quality", "preset", "samples", "tolerance", "light_samples",
              "caustics", "cut", "tiers", "screen", "model", "max_layers", "exposure", "camera_light",
              "purposes")  # fmt: skip
+
+
+def laid_out(stage: str, root: str, settings: Mapping[str, Any], limits: Mapping[str, int]) -> tuple[str, str]:
+    """An upload of several files as a folder, which becomes the current one. Anything else stays as it is.
+
+    Returns:
+        The stage, relative to the current folder, and that folder.
+
+    Raises:
+        Problem: a file is refused, or none of them is the stage.
+    """
+    if not stage.endswith(uploads.ARCHIVE):
+        return stage, root
+    folder = os.path.realpath(tempfile.mkdtemp(prefix="upload-"))
+    chosen = uploads.stage_among(uploads.unpack(stage, folder, limits), settings.get("stage") or "")
+    os.chdir(folder)
+    return chosen, folder
 
 
 def perform(kind: str, stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[str, int], say: Say) -> Any:
@@ -48,6 +71,8 @@ def perform(kind: str, stage: str, out: str, settings: Mapping[str, Any], limits
 
     codec.MAX_TEXTURE_PIXELS = min(codec.MAX_TEXTURE_PIXELS, limits["texture_pixels"])
     try:
+        if kind != "convert" and stage.lower().endswith(uploads.GLTF):
+            stage = _as_usd(stage, say, limits)
         return _VERBS[kind](stage, out, settings, limits, say)
     except StageError as error:
         raise Problem("stage-invalid", _public(str(error))) from None
@@ -55,9 +80,16 @@ def perform(kind: str, stage: str, out: str, settings: Mapping[str, Any], limits
         if str(error).startswith("camera ") and settings.get("camera"):
             raise Problem("invalid-settings", _public(str(error)),
                           errors=[{"pointer": "/camera", "detail": "the stage has no such camera"}]) from None
+        if str(error).startswith("variant "):
+            raise Problem("invalid-settings", _public(str(error)),
+                          errors=[{"pointer": "/variants", "detail": "the stage has no such variant"}]) from None
+        if "needs the extra" in str(error):
+            text = "glTF is not read here: the extra `gltf` is not installed"
+            raise Problem("unsupported-media-type", text) from None
         raise Problem("invalid-settings", _public(str(error))) from None
     except (SceneError, ImageError) as error:
         if "cannot be encoded" in str(error):  # a picture of ours, not of the stage
+            _check_room(limits["result_bytes"])
             text = "a picture of this size and form is larger than this service or its format allows"
             raise Problem("limit-exceeded", text) from error
         raise Problem("stage-invalid", _public(str(error))) from None
@@ -70,13 +102,52 @@ def perform(kind: str, stage: str, out: str, settings: Mapping[str, Any], limits
         raise Problem("stage-invalid", _public(str(error))) from None
 
 
+def _check_room(size: int) -> None:
+    """Writers of pictures do not say why they fail. Raises OSError where there is no room for the largest result."""
+    with tempfile.TemporaryFile() as file:
+        os.posix_fallocate(file.fileno(), 0, size)
+
+
+def _as_usd(stage: str, say: Say, limits: Mapping[str, int]) -> str:
+    """A glTF file as USD with its glass described, as `refract convert` makes it, in a folder that becomes the current
+    one."""
+    from refract_core.verbs.convert import ConvertOrder, convert
+
+    from . import precheck
+
+    say(progress=0.0, stage="reading glTF")
+    folder, name = tempfile.mkdtemp(prefix="gltf-"), f"{os.path.splitext(os.path.basename(stage))[0]}.usdz"
+    done = convert(ConvertOrder(stage=stage, out=os.path.join(folder, name)))
+    _tell(done.notices, say, limits)
+    os.chdir(folder)
+    try:
+        precheck.check_size(name, limits["prims"])
+    except precheck.TooMany as error:
+        raise Problem("limit-exceeded", str(error)) from None
+    return name
+
+
 def _public(text: str) -> str:
-    """A message without USD's own words, which quote files, and without paths of this machine."""
-    text = text.split(" cannot be read as ")[0] + " cannot be read as USD" if " cannot be read as " in text else text
+    """A message without USD's own words, which quote files, and without paths of this machine; with the place that
+    USD's words are about."""
+    place = _place_of(text)
+    name, unreadable, why = text.partition(" cannot be read as ")
+    if unreadable:
+        ours = f": {_CUT_OFF}" if _CUT_OFF in why else ""
+        text = f"{name} cannot be read as USD{ours}"
     if text.startswith("USD says:"):
-        return "USD warned about this stage; `refract render` on it shows what it said"
-    text = re.sub(_QUOTES, "", text).strip()
+        return f"USD warned about this stage{place}; `refract render` on it shows what it said"
+    text = re.sub(_QUOTES, "", text).strip() + place
     return without_folders(text, {*own_folders(), *own_places()})[:500]
+
+
+def _place_of(text: str) -> str:
+    """`: line 7, column 5: expected }` of a message in which USD quotes a layer it cannot parse; else ''."""
+    found = _PARSED.search(text)
+    if not found:
+        return ""
+    wanted = f": expected {found['wanted']}" if found["wanted"] else ""
+    return f": line {found['line']}, column {found['column']}{wanted}"
 
 
 def _tell(notices: tuple[Notice, ...] | list[Notice], say: Say, limits: Mapping[str, int]) -> None:
@@ -91,51 +162,91 @@ def _tell(notices: tuple[Notice, ...] | list[Notice], say: Say, limits: Mapping[
 def _render(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[str, int], say: Say) -> Any:
     from refract_core.rendering.picture import render
     from refract_core.rendering.ready import choose_camera
+    from refract_core.rendering.session import Session
     from refract_core.usd.settings import read_settings
-    from refract_core.usd.stage import open_stage, scene_from_stage
+    from refract_core.usd.stage import open_stage, scene_from_stage, select_variants
     from refract_core.verbs.render_files import chosen_settings
     from refract_core.view.camera import image_size
 
     say(progress=0.0, stage="reading the stage")
     opened = open_stage(stage)
-    found: list[Notice] = []
-    authored = read_settings(opened, "", found)
+    select_variants(opened, settings.get("variants") or ())
+    told: list[Notice] = []
+    authored = read_settings(opened, "", told)
     asked = {name: settings[name] for name in _SETTINGS if settings.get(name) is not None}
     said = {name: tuple(value) if isinstance(value, list) else value for name, value in asked.items()}
     wanted = chosen_settings(authored, {**said, "jobs": settings["threads"]})
-    scene = scene_from_stage(
-        opened, time_code=settings.get("time_code"), purposes=wanted.purposes, camera=wanted.camera
-    )
-    reading.has_ended()
-    _check_scene(scene, limits)
-    width, height = image_size(choose_camera(scene, wanted.camera), wanted.image_width, wanted.image_height)
-    _check_size(width, height, wanted.samples, limits)
     overrides = settings.get("overrides") or {}
-    scene = _override(scene, overrides)
-    told = [*found, *scene.notices]
-    frame = render(scene, wanted, progress=lambda share, work: say(progress=share, stage=work))
-    _tell([*told, *frame.notices], say, limits)
+    sizes = [(width, 0) for width in settings.get("widths") or ()] or [(wanted.image_width, wanted.image_height)]
+    times = settings.get("time_codes") or [settings.get("time_code")]
+    count = len(sizes) * len(times)
+    session = Session() if count > 1 else None
+    done: list[dict[str, Any]] = []
+    for time_code in times:
+        scene = scene_from_stage(opened, time_code=time_code, purposes=wanted.purposes, camera=wanted.camera)
+        reading.has_ended()
+        _check_scene(scene, limits)
+        camera = choose_camera(scene, wanted.camera)
+        measured = [image_size(camera, *size) for size in sizes]
+        _check_sizes(measured, len(times), wanted.samples, settings["format"], limits)
+        scene = _override(scene, overrides)
+        told += scene.notices
+        for width, height in measured:
+            this = replace(wanted, image_width=width, image_height=height)
+            frame = render(scene, this, session=session, progress=_share_of(say, len(done), count))
+            told += frame.notices
+            frame = replace(frame, metadata={**frame.metadata, **override_notes(overrides)})
+            _save_picture(frame, out, settings, f"picture.{len(done)}" if count > 1 else "image")
+            done.append({"width": frame.width, "height": frame.height, "time_code": float(scene.time_code)})
+    _tell(told, say, limits)
+    size = {"width": done[0]["width"], "height": done[0]["height"]}
+    if count > 1:
+        _pack_pictures(out, settings["format"], done)
+        return {**size, "pictures": done}
+    return {**size, "aovs": _save_planes(frame, out, settings)}
+
+
+def _share_of(say: Say, before: int, count: int) -> Callable[[float, str], None]:
+    """Progress of one picture of several as that of all."""
+    return lambda share, work: say(progress=(before + share) / count, stage=work)
+
+
+def _save_picture(frame: Frame, out: str, settings: Mapping[str, Any], name: str) -> None:
+    """The picture; where the format holds them, with the planes that were asked for, or all where none was."""
+    extension, aovs = settings["format"], settings.get("aovs") or []
+    held = tuple(dict.fromkeys(("beauty", *aovs))) if aovs and extension == "exr" else ()
     correction = settings.get("color_correction") or "sRGB"
-    aovs = settings.get("aovs") or []
-    extension = settings["format"]
-    frame = replace(frame, metadata={**frame.metadata, **override_notes(overrides)})
-    frame.save(os.path.join(out, f"image.{extension}"), aovs=aovs if extension == "exr" else (),
-               color_correction=correction)  # fmt: skip
+    frame.save(os.path.join(out, f"{name}.{extension}"), aovs=held, color_correction=correction)
+
+
+def _save_planes(frame: Frame, out: str, settings: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Every plane that was asked for as a PNG of its own. Returns what white means in each."""
     kept = []
-    for name in aovs:
+    for name in settings.get("aovs") or []:
         if name == "P":  # no picture holds positions
             continue
-        white = 1.0
+        white, shown = 1.0, frame
         if name in _UNITS:
             plane = frame.planes[name]
             finite = plane[np.isfinite(plane)]
             white = max(float(finite.max()) if finite.size else 1.0, 1e-9)
             shown = replace(frame, planes={name: (plane / np.float32(white)).astype(np.float32)})
-        else:
-            shown = frame
+        correction = settings.get("color_correction") or "sRGB"
         shown.save(os.path.join(out, f"aov.{name}.png"), aovs=[name], color_correction=correction)
         kept.append({"name": name, "white": white})
-    return {"width": frame.width, "height": frame.height, "aovs": kept}
+    return kept
+
+
+def _pack_pictures(out: str, extension: str, done: list[dict[str, Any]]) -> None:
+    """All pictures in one archive, beside themselves."""
+    with contextlib.ExitStack() as files:
+        named = {
+            f"{number:04}_{one['width']}x{one['height']}.{extension}": files.enter_context(
+                open(os.path.join(out, f"picture.{number}.{extension}"), "rb")
+            )
+            for number, one in enumerate(done)
+        }
+        uploads.pack(named, os.path.join(out, "pictures.zip"))
 
 
 def _check_scene(scene: Scene, limits: Mapping[str, int]) -> None:
@@ -151,6 +262,22 @@ def _check_size(width: int, height: int, samples: int, limits: Mapping[str, int]
         if value > limits[name]:
             what = f"{width} x {height} pixels with {samples} samples"
             raise Problem("limit-exceeded", f"{what}: {name} would be {value}; the limit is {limits[name]}")
+
+
+def _check_sizes(
+    sizes: list[tuple[int, int]], times: int, samples: int, extension: str, limits: Mapping[str, int]
+) -> None:  # fmt: skip
+    longest = formats.BY_EXTENSION[extension].longest_side
+    for width, height in sizes:
+        _check_size(width, height, samples, limits)
+        if max(width, height) > longest:
+            text = f"{width} x {height} pixels are more than a .{extension} can hold; its sides have at most {longest}"
+            raise Problem("invalid-settings", text, errors=[{"pointer": "/format", "detail": text}])
+    every = times * samples * sum(width * height for width, height in sizes)
+    if every > limits["pixel_samples"]:
+        what = f"{times * len(sizes)} pictures from {sizes[0][0]} x {sizes[0][1]} pixels on, with {samples} samples"
+        text = f"{what}: pixel_samples would be {every}; the limit is {limits['pixel_samples']}"
+        raise Problem("limit-exceeded", text)
 
 
 def _override(scene: Scene, overrides: Overrides) -> Scene:

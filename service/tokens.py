@@ -17,6 +17,8 @@ from refract_core.errors import UsageError
 SCOPES = {"read": "what there is, and the owner's own jobs", "render": "work, and its cancellation",
           "metrics": "/metrics"}  # fmt: skip
 """What a token can be for -> what that lets it ask."""
+SIGNABLE = "/v1/thumbnails/"
+"""Where the addresses begin that a signature opens, too. A look at one may be work."""
 _SHORTEST = 8
 _NAME = re.compile(r"[A-Za-z0-9._@-]{1,64}")
 _DIGEST = re.compile(r"sha256:([0-9a-fA-F]{64})")
@@ -73,4 +75,5 @@ def needed(method: str, path: str) -> str:
         return "metrics"
     if not path.startswith("/v1/"):
         return ""
-    return "read" if method in ("GET", "HEAD", "OPTIONS") else "render"
+    looks = method in ("GET", "HEAD", "OPTIONS") and not path.startswith(SIGNABLE)
+    return "read" if looks else "render"

@@ -26,6 +26,7 @@ from typing import Any
 
 from . import confine
 from .quota import OFTEN, WORDS, Quota
+from .uploads import ARCHIVE
 
 _QUIET = {"PXR_WORK_THREAD_LIMIT": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENIMAGEIO_THREADS": "1",
           "PXR_AR_DISABLE_PLUGIN_RESOLVER": "1", "PXR_AR_DISABLE_PLUGIN_URI_RESOLVERS": "1",
@@ -248,7 +249,10 @@ def _serve(descriptor: int, knocker: int) -> int:
 def _knock(knocker: int, job: dict[str, Any]) -> None:
     """Tell the parent which folder to watch."""
     limits = job["limits"]
-    quota = [os.path.realpath(job["folder"]), limits["folder_bytes"], limits["folder_files"]]
+    most_bytes, most_files = limits["folder_bytes"], limits["folder_files"]
+    if job["stage"].endswith(ARCHIVE):  # laid out beside what the job itself writes
+        most_bytes, most_files = most_bytes + limits["stage_bytes"], most_files + 2 * limits["upload_files"]
+    quota = [os.path.realpath(job["folder"]), most_bytes, most_files]
     os.write(knocker, json.dumps(quota).encode())
     os.close(knocker)
 
@@ -274,14 +278,15 @@ def _perform(job: dict[str, Any], say: Any) -> Any:
     if job.get("forbidden"):  # for tests: prove that the lock holds
         return _try_to_escape(job["forbidden"])
     reading.begins(limits["stage_seconds"])
+    stage, root = tasks.laid_out(job["stage"], root, job["settings"], limits)
     try:
-        held = precheck.check_stage(job["stage"], root, layers=limits["layers"], unpacked_bytes=limits["stage_bytes"])
-        precheck.check_size(job["stage"], limits["prims"])
+        held = precheck.check_stage(stage, root, layers=limits["layers"], unpacked_bytes=limits["stage_bytes"])
+        precheck.check_size(stage, limits["prims"])
     except precheck.TooMany as error:
         raise Problem("limit-exceeded", str(error)) from None
     except precheck.Refused as error:
         raise Problem("stage-refused", str(error)) from None
-    done = tasks.perform(job["kind"], job["stage"], out, job["settings"], limits, say)
+    done = tasks.perform(job["kind"], stage, out, job["settings"], limits, say)
     del held  # until here, for USD to find its layers read
     return done
 

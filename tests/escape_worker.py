@@ -258,8 +258,12 @@ def try_all(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[s
     return {}
 
 
+TENS = 130
+"""Files of 10 MiB: more than a job may have by default."""
+
+
 def fill(out: str) -> None:
-    for number in range(100):
+    for number in range(TENS):
         with open(os.path.join(out, f"a{number}"), "wb") as file:
             for _ in range(10):
                 file.write(bytes(1 << 20))
@@ -267,7 +271,7 @@ def fill(out: str) -> None:
 
 def fill_removed(_out: str) -> None:
     held = []
-    for number in range(100):
+    for number in range(TENS):
         name = os.path.join(os.environ["TMPDIR"], f"a{number}")
         file = open(name, "wb")  # noqa: SIM115  held open, which is the point
         held.append(file)

@@ -84,7 +84,7 @@ class Job:
         return {
             "id": self.id, "kind": "render", "status": status, "fraction": fraction, "stage_of_work": "tiles",
             "created": "", "started": None, "finished": None, "warnings": warnings, "width": WIDTH, "height": HEIGHT,
-            "aovs": aovs, "problem": problem if status == "failed" else None, "links": {},
+            "aovs": aovs, "pictures": [], "problem": problem if status == "failed" else None, "links": {},
         }  # fmt: skip
 
     def picture(self, name: str) -> bytes:

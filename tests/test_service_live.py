@@ -16,6 +16,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -506,7 +507,7 @@ def outcome(jobs: Jobs, source: Fails, message: dict[str, Any], monkeypatch: pyt
     async def work() -> dict[str, Any]:
         monkeypatch.setattr(source, "fork", fork)
         jobs.start()
-        record = jobs.submit("render", {"samples": 1}, "digest", "a.usda", None)
+        record = jobs.submit("render", {"samples": 1, "format": "png"}, "digest", "a.usda", None)
         async with asyncio.timeout(PATIENCE):
             await jobs.ended(record)
         await jobs.stop()
@@ -530,6 +531,21 @@ def test_a_fault_of_ours_is_counted_apart(tmp_path: Path, monkeypatch: pytest.Mo
     assert sample(jobs.metrics, "refract_worker_crashes_total") == 0.0
 
 
+def test_a_worker_that_is_done_and_made_nothing_is_a_fault_of_ours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:  # fmt: skip
+    async def make() -> tuple[Jobs, Fails]:
+        source = Fails([])
+        jobs = jobs_of(tmp_path, source, workers=1)
+        jobs.stage_root = tmp_path
+        return jobs, source
+
+    jobs, source = asyncio.run(make())
+    said = outcome(jobs, source, {"done": {"width": 8, "height": 8}}, monkeypatch)
+    assert (said["status"], said["problem"]["type"]) == ("failed", "/problems/worker-fault")
+    assert "image" not in said["links"]
+
+
 def test_an_exception_in_a_worker_is_a_fault_of_ours(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """By the worker's own road: what it says of an exception that nothing in it has caught."""
     from service import worker
@@ -549,7 +565,7 @@ def test_an_exception_in_a_worker_is_a_fault_of_ours(monkeypatch: pytest.MonkeyP
         monkeypatch.setattr(worker, "_perform", fail)
         ours, theirs = socket.socketpair()
         with ours, theirs:
-            ours.sendall(b"{}\n")
+            ours.sendall(json.dumps({"folder": "/", "stage": "a.usda", "limits": asdict(Limits())}).encode() + b"\n")
             assert worker._serve(theirs.fileno(), os.open(os.devnull, os.O_WRONLY)) == 0
             said = [json.loads(line) for line in ours.recv(65536).splitlines()]
         assert said[0] == {"began": True}

@@ -160,6 +160,7 @@ class Sleeper:
         self.said: Iterator[tuple[float, dict[str, Any]]] = iter(())
 
     async def give(self, job: dict[str, Any]) -> None:
+        Path(job["folder"], "out", f"image.{job['settings']['format']}").write_bytes(b"picture")
         seconds, steps = job["settings"]["seconds"], 20 if job["settings"]["tells"] else 1
         progress = [(seconds / steps, {"progress": n / steps, "stage": "image"}) for n in range(1, steps)]
         self.said = iter([(0.0, {"began": True}), *progress, (seconds / steps, {"done": {}})])

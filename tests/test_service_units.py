@@ -337,7 +337,8 @@ def test_the_openapi_document_tells_what_is_refused(client: InProcess) -> None:
         assert named["required"] == ["stage"]
         assert named["properties"]["stage"]["type"] == "string"
         uploaded = body["multipart/form-data"]["schema"]["properties"]["settings"]["contentSchema"]
-        assert uploaded["properties"].keys() == named["properties"].keys() - {"stage"}
+        assert uploaded["properties"].keys() == named["properties"].keys()
+        assert "required" not in uploaded
     operations = [one for path in document["paths"].values() for one in path.values()]
     every = [answer for one in operations for answer in one["responses"].items()]
     for status, answer in every:
@@ -345,6 +346,23 @@ def test_the_openapi_document_tells_what_is_refused(client: InProcess) -> None:
     statuses = {int(status) for status, _ in every}
     # No tokens here; and a method that is not allowed is no operation.
     assert {kind.status for kind in KINDS.values()} - statuses == {401, 405}
+
+
+def test_the_openapi_document_sorts_its_operations_and_its_examples_are_right(client: InProcess) -> None:
+    document = client.get("/openapi.json").json()
+    known = [tag["name"] for tag in document["tags"]]
+    assert all(one["tags"] and set(one["tags"]) <= set(known) for path in document["paths"].values()
+               for one in path.values())  # fmt: skip
+    assert document["servers"][0]["url"] == "/"
+    for verb, model in models.KINDS.items():
+        content = document["paths"][f"/v1/{verb}"]["post"]["requestBody"]["content"]["application/json"]
+        assert content["examples"]
+        for example in content["examples"].values():
+            assert (GOOD / str(check(model, example["value"]).stage)).is_file()
+    operations = [one for path in document["paths"].values() for one in path.values()]
+    for status, answer in (pair for one in operations for pair in one["responses"].items()):
+        if "application/problem+json" in answer.get("content", {}):
+            assert answer["content"]["application/problem+json"]["example"]["status"] == int(status)
 
 
 @pytest.mark.parametrize(("path", "methods"), [("/v1/render", "POST"), ("/v1/jobs/x", "DELETE, GET, HEAD"),

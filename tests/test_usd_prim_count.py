@@ -163,6 +163,28 @@ def test_what_leads_back_to_itself_is_left_out_as_usd_does() -> None:
     assert count_prims(layer_of(circles(4))).prims >= composed(layer_of(circles(4)))
 
 
+def between(*arcs: tuple[str, str, str]) -> str:
+    """Prims that refer to one place and hold an `A` that refers to another: name, target, target of its `A`."""
+    return "#usda 1.0\n" + "".join(
+        f'def "{name}" (\n    references = <{target}>\n)\n{{\n    def "A" (\n        references = <{inner}>\n    )\n'
+        "    {\n    }\n}\n" for name, target, inner in arcs
+    )  # fmt: skip
+
+
+def test_arcs_between_a_prim_and_its_own_parts_are_left_out_as_usd_does() -> None:
+    """Each way around makes the path longer, so it comes by no place twice."""
+    own = layer_of(between(("World", "/World/A", "/World")))
+    assert (count_prims(own).prims, count_prims(own).more) == (2, False)
+    assert composed(own) == 2
+
+
+def test_paths_that_only_grow_are_given_up_on() -> None:
+    """Of two prims, each is a part of the other: neither arc leads back by itself."""
+    found = count_prims(layer_of(between(("P", "/Q/A", "/Q"), ("Q", "/P/A", "/P"))), stop=200_000)
+    assert found.more
+    assert found.opinions < 10_000
+
+
 def circles(count: int) -> str:
     """Prims that each hold a reference to every other: as many ways through as orders."""
     def body(one: int) -> str:

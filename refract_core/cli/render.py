@@ -19,8 +19,8 @@ Out = Annotated[
     str,
     typer.Argument(
         metavar="OUT",
-        help="The picture to write: .exr holds all AOVs, .png, .jpg and .tif hold one. With --frames the file name "
-        "has one ### group, such as shot.###.png, or shot.###.##.png for fractions of a frame.",
+        help="The picture to write: .exr holds all AOVs, .png, .jpg, .webp and .tif hold one. With --frames the file "
+        "name has one ### group, such as shot.###.png, or shot.###.##.png for fractions of a frame.",
     ),
 ]
 Camera = Annotated[

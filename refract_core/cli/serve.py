@@ -89,6 +89,14 @@ RequireConfinement = Annotated[
         "over is not alone. Without it, the start and /readyz say what is missing.",
     ),
 ]
+KeyFile = Annotated[
+    str,
+    typer.Option(
+        metavar="FILE",
+        envvar="REFRACT_KEY_FILE",
+        help="One line: the secret that signs addresses of thumbnails, and webhooks. Without it, there are neither.",
+    ),
+]
 Limit = Annotated[
     list[str] | None,
     typer.Option(
@@ -128,6 +136,7 @@ def serve(
     executor: Executor = "",
     token_file: TokenFile = "",
     require_confinement: RequireConfinement = False,
+    key_file: KeyFile = "",
     limit: Limit = None,
     log: Log = "auto",
     limits: ShowLimits = False,
@@ -159,7 +168,7 @@ def serve(
         settings = Settings(
             stage_root=stage_root, data=data, executor=executor, queue=queue, tokens=_tokens(token_file), limits=chosen,
             allow_hosts=tuple(allow_host or ()), allow_origins=tuple(allow_origin or ()),
-            proxies=tuple(proxy or ()),
+            proxies=tuple(proxy or ()), key=_key(key_file),
             workers=workers if workers is not None else _SENT if executor else os.cpu_count() or 1,
         )  # fmt: skip
         run(settings, host, port, log)
@@ -182,6 +191,19 @@ def _numbers(given: list[str]) -> dict[str, int | None]:
         except ValueError as error:
             raise UsageError(f"--limit {text}: write NAME=NUMBER, with a whole number of 1 or more") from error
     return found
+
+
+def _key(path: str) -> str:
+    """The one line of a file. Raises UsageError."""
+    if not path:
+        return ""
+    try:
+        lines = Path(path).read_text("utf-8").split()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"--key-file {path}: cannot be read") from error
+    if len(lines) != 1:
+        raise UsageError(f"--key-file {path}: holds {len(lines)} words; write one, long and random")
+    return lines[0]
 
 
 def _tokens(path: str) -> tuple[str, ...]:

@@ -168,7 +168,8 @@ def _rgba(pixels: NDArray[Any], spec: Any) -> NDArray[Any]:
     if count == 4 and alpha == 3:
         return np.ascontiguousarray(pixels)
     out = np.empty((*pixels.shape[:2], 4), pixels.dtype)
-    out[..., :3] = pixels[..., rgb]
+    for channel, column in enumerate(rgb):  # one by one: all three at once would be a copy of a large picture
+        out[..., channel] = pixels[..., column]
     out[..., 3] = pixels[..., alpha] if alpha >= 0 else opaque
     return out
 
@@ -197,6 +198,15 @@ def exr_spec(
     for key, value in metadata.items():
         spec.attribute(key, value)
     return spec
+
+
+def writes(extension: str) -> bool:
+    """Whether this OpenImageIO can write a format, by the extension of its files; some are left out of some builds."""
+    import OpenImageIO as oiio
+
+    formats = set(str(oiio.get_string_attribute("output_format_list")).split(","))
+    known = (one.partition(":") for one in str(oiio.get_string_attribute("extension_list")).split(";"))
+    return any(name in formats and extension[1:] in extensions.split(",") for name, _, extensions in known)
 
 
 def encoded(path: str, pixels: NDArray[Any], spec: Any) -> bytes:

@@ -41,8 +41,9 @@ class Frame:
     def save(self, path: str | os.PathLike[str], *, aovs: Sequence[str] = (), color_correction: str = "sRGB") -> None:
         """Write the picture to `path`; its extension chooses the format.
 
-        EXR holds scene-linear values of all chosen planes. PNG, JPEG and TIFF hold one plane as 8 bits: colours go
-        through `color_correction`, the normal is mapped from [-1, 1] to [0, 1], scalars are grey clamped to [0, 1].
+        EXR holds scene-linear values of all chosen planes. PNG, JPEG, TIFF, WebP and AVIF hold one plane as 8 bits:
+        colours go through `color_correction`, the normal is mapped from [-1, 1] to [0, 1], scalars are grey clamped to
+        [0, 1].
 
         Args:
             path: file to write; a file of that name is replaced in one step, or not at all.

@@ -32,6 +32,8 @@ CEILING = 10**18
 CIRCLES = 20_000
 """Ways through references that lead back to where they come from: they multiply as the orders of a set do, and nothing
 is added up but by walking them. 20,000 take half a second; composing makes an error of each."""
+_GROWTH = 64
+"""Parts by which a path may become longer than all that are written in the layers, on its way through references."""
 _ROOT = Sdf.Path.absoluteRootPath
 _FILES = ("references", "payload")
 _CLASSES = ("inheritPaths", "specializes")
@@ -212,6 +214,10 @@ class _Counting:
         self.seen: set[_Site] = set()
         self.again = 0
         """Sites looked at once more, for what they count depends on how they are come by: they are in a circle."""
+        self.longest = 0
+        """Parts of the longest path that is written in the layers, as far as they have been looked at."""
+        self.grows = False
+        """Paths become longer and longer: references of several prims lead below one another."""
 
     def count(self, start: _Site) -> Count:
         frames = [self._begin(start)]
@@ -225,7 +231,7 @@ class _Counting:
                 elif site in active:  # a circle: USD leaves this arc out
                     frame.values[site] = Count(1, 0)
                     frame.lowest = min(frame.lowest, active[site])
-                elif len(self.seen) >= self.stop or self.again >= CIRCLES:
+                elif len(self.seen) >= self.stop or self.again >= CIRCLES or self.grows:
                     looked_at = len(self.seen) + self.again
                     return Count(looked_at, looked_at, more=True)
                 else:
@@ -250,6 +256,7 @@ class _Counting:
             terms, leaves, opinions = list(self._inherited(site)), 0, 0
         else:
             specs = self.layers.specs(site)
+            self.longest = max(self.longest, site.path.pathElementCount if specs else 0)
             below, leaves, opinions = self._children(site, specs)
             terms, opinions = [*below, *self._arcs(site, specs), *_points(site, specs)], opinions + len(specs)
         return _Frame(site, terms, leaves, opinions, list({one for term in terms for one in term.sites}))
@@ -278,7 +285,9 @@ class _Counting:
             here = _Site(site.stack, above)
             rest = _beyond(site.path, above)
             for term in self._arcs(here, self.layers.specs(here)):
+                self.longest = max(self.longest, *(one.path.pathElementCount for one in term.sites))
                 moved = tuple(_Site.referred(one.stack, _joined(one.path, rest)) for one in term.sites)
+                self.grows |= max(one.path.pathElementCount for one in moved) > self.longest + _GROWTH
                 yield _Term(moved, same=True)
 
     def _arcs(self, site: _Site, specs: list[Sdf.PrimSpec]) -> Iterator[_Term]:
@@ -291,13 +300,17 @@ class _Counting:
             for key in _FILES:
                 for item in _items(spec, key) if key in keys else ():
                     target = self._target(site, spec.layer, item)
-                    if target is not None and (again := (target, item.layerOffset)) not in once:
+                    if target is None or _leads_back(site, target):
+                        continue
+                    if (again := (target, item.layerOffset)) not in once:
                         once.add(again)
                         yield _Term((target,), same=True)
             for key in _CLASSES:
                 for path in _items(spec, key) if key in keys else ():
                     for stack in (site.stack, *self.layers.users[site.stack]):
                         target = _Site.referred(stack, path)
+                        if _leads_back(site, target):
+                            continue
                         if target not in once and (stack == site.stack or self.layers.specs(target)):
                             once.add(target)
                             yield _Term((target,), same=True)
@@ -316,6 +329,12 @@ class _Counting:
             return None
         path = item.primPath or self.layers.stacks[stack][0].GetDefaultPrimAsPath()
         return _Site.referred(stack, path) if path else None
+
+
+def _leads_back(site: _Site, target: _Site) -> bool:
+    """From a prim to one above or below it: USD makes an error of such an arc, and leaves it out."""
+    here, there = site.path.StripAllVariantSelections(), target.path.StripAllVariantSelections()
+    return site.stack == target.stack and (here.HasPrefix(there) or there.HasPrefix(here))
 
 
 def _sum(frame: _Frame) -> Count:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,7 @@ Keep = Callable[[list[Placement], Tables], list[Placement]]
 
 FALLBACK_METRES_PER_UNIT = 0.01
 _WARNINGS = 20
+_VARIANT = re.compile(r"(?P<prim>(?:/\w+)*)\{(?P<set>[^{}=]{1,200})=(?P<name>[^{}=]{1,200})\}")
 
 
 def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
@@ -73,6 +75,32 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
         recognised(stage)
     refuse_too_many(stage)
     return stage
+
+
+def select_variants(stage: Usd.Stage, chosen: Iterable[str]) -> None:
+    """Choose variants over what the stage itself chooses, in its session layer.
+
+    Args:
+        chosen: as USD writes them, `/World/Car{paint=red}`; without a path, `{paint=red}` is of the default prim.
+
+    Raises:
+        UsageError: there is no such prim, set or variant.
+    """
+    for text in chosen:
+        found = _VARIANT.fullmatch(text)
+        if not found:
+            raise UsageError(f"variant '{text[:200]}' is not written as /Prim{{set=name}}")
+        prim = stage.GetPrimAtPath(found["prim"]) if found["prim"] else stage.GetDefaultPrim()
+        if not prim:
+            raise UsageError(f"variant '{text[:200]}': the stage has no such prim")
+        known = prim.GetVariantSets().GetNames()
+        if found["set"] not in known:
+            raise UsageError(f"variant '{text[:200]}': the prim has the sets {', '.join(known) or '(none)'}")
+        one = prim.GetVariantSet(found["set"])
+        if found["name"] not in one.GetVariantNames():
+            raise UsageError(f"variant '{text[:200]}': choose from {', '.join(one.GetVariantNames())}")
+        with Usd.EditContext(stage, stage.GetSessionLayer()), captured():
+            one.SetVariantSelection(found["name"])
 
 
 def time_range(stage: Usd.Stage) -> tuple[float, float]:

@@ -106,7 +106,9 @@ def _fill(pool: NDArray[Any], levels: NDArray[np.int64], texture: Texture, decod
     for level, (offset, width, height) in enumerate(levels):
         place = pool[offset : offset + width * height].reshape(height, width, 4)
         if level == 0 and pool.dtype != np.uint8:
-            place[...] = np.nan_to_num(finer, nan=0.0, posinf=LARGEST, neginf=-LARGEST)
+            place[...] = finer
+            for row in place:  # in place and row by row: a large texture fits into memory twice, not four times
+                np.nan_to_num(row, copy=False, nan=0.0, posinf=LARGEST, neginf=-LARGEST)
             finer = place
         elif level == 0:
             place[...] = finer
