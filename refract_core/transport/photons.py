@@ -108,7 +108,7 @@ class PhotonScratch(NamedTuple):
 
 
 @kernel
-def weigh_sources(world: World, sources: Sources, first: int, last: int) -> int:
+def weigh_sources(world: World, sources: Sources, first: int, last: int) -> None:
     """Fill `sources.flux` of rows `first` to before `last`: the mean over the corners and the middle of each piece."""
     for e in range(first, last):
         total = 0.0
@@ -118,7 +118,6 @@ def weigh_sources(world: World, sources: Sources, first: int, last: int) -> int:
             p, n = _place_at(world, sources, e, a, b)
             total += dot(_unoccluded(world, sources.light[e], p, n), TEXEL_LUMINANCE)
         sources.flux[e] = 0.25 * total * sources.area[e]
-    return 0
 
 
 @inlined
