@@ -58,6 +58,7 @@ def serve(settings: Settings, host: str, port: int, log: str = "auto") -> None:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((host, port))
+        listener.listen(_BACKLOG)  # before the address is told: who comes at once waits, and is not refused
     except (OSError, OverflowError) as error:
         listener.close()
         raise UsageError(f"--host {host} --port {port}: cannot be used: {error}") from error
