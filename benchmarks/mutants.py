@@ -26,6 +26,7 @@ ROOT = Path(__file__).parents[1]
 ORACLE = "tests/test_oracle.py"
 LAWS = "tests/test_render_laws.py"
 CORNERS = ("tests/test_corners.py",)
+CAUSTICS = ("tests/test_caustics.py", "tests/test_shading.py", ORACLE)
 TREE = "tests/test_tree.py"
 SCREEN = (TREE, LAWS, "tests/test_screen.py", "tests/test_shading.py", "tests/test_nothing_invented.py")
 COPIED = (
@@ -250,6 +251,32 @@ MUTANTS = (
            "query.rays[lane] if alone else max(", "1 if alone else max(", CORNERS),
     Mutant("an edge is as sure as any pixel", "transport/corners.py",
            "1.0 - min(1.0, _expected_error(own.contrast[k], taken))", "1.0", CORNERS),
+    # --- light through glass, on its way to what it lights
+    Mutant("photons fall on the wrong side", "rendering/caustics.py",
+           "((1.0, np.arange(len(parts))), (-1.0,", "((-1.0, np.arange(len(parts))), (-1.0,", CAUSTICS),
+    Mutant("no light comes from within a body", "rendering/caustics.py",
+           "np.flatnonzero(np.isin(parts, within))", "np.flatnonzero(np.isin(parts, [-1]))", CAUSTICS),
+    Mutant("a photon counts its texel's height", "world/caustics.py",
+           "scale = abs(n[axis]) / (texel * texel)", "scale = 1.0 / (texel * texel)", CAUSTICS),
+    Mutant("no layer but one's own", "world/caustics.py", "for k in range(-1, 2):", "for k in range(1):", CAUSTICS),
+    Mutant("texels keep all of each photon", "world/caustics.py",
+           "share = (s if i else 1.0 - s) * (t if j else 1.0 - t)", "share = 0.5", CAUSTICS),
+    Mutant("a seam where the axis changes", "world/caustics.py",
+           "share = max(0.0, n[axis] * n[axis] - _AXIS_SHARE * _AXIS_SHARE)",
+           "share = 1.0 if axis == _main_axis(n) else 0.0", CAUSTICS),
+    Mutant("flat lights are even however near", "transport/photons.py",
+           "if not flat or a <= 0.0:", "if True:", CAUSTICS),
+    Mutant("photons fall through what stands before a light", "transport/photons.py",
+           "flux = mul(row(own.brought, lane), row(own.arrives, lane))", "flux = row(own.brought, lane)", CAUSTICS),
+    Mutant("glass that throws caustics lets light through, too", "world/tracing.py",
+           "if glass.casts[hit.part] != 0:", "if glass.casts[hit.part] > 1:", CAUSTICS),
+    Mutant("a body absorbs from the receiver on", "world/tracing.py",
+           "length = hit.t - packet.begun[lane]", "length = hit.t", CAUSTICS),
+    Mutant("walls on the way are clear", "world/tracing.py",
+           "share = 1.0 - fresnel_dielectric(cosine, 1.0 / ior)", "share = 1.0", CAUSTICS),
+    Mutant("a hole hides the glass before it", "world/tracing.py",
+           "if packet.valid[lane] != 0:  # from where it began", "if False:  # from where it began", CAUSTICS),
+    Mutant("every sample tosses the same coin", "world/tracing.py", "sample * _GOLDEN % 1.0", "0.0 * sample", CAUSTICS),
 )  # fmt: skip
 
 
