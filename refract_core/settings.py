@@ -27,7 +27,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 """Settings that make other renderers' pictures."""
 PURPOSES = ("default", "render", "proxy", "guide")
 MAX_PIXELS = 1 << 28
-MAX_PHOTONS = 1 << 26
+MAX_PHOTONS = 1 << 24
 
 
 def named_settings(quality: str = "", preset: str = "") -> dict[str, Any]:
@@ -73,7 +73,7 @@ class RenderSettings:
     cut: float = 0.02
     """Weight below which a branch of light is not followed for itself, but given to its stronger sibling, 0 .. 1."""
     caustics: int = 1 << 16
-    """Photons that bring light through traced glass, and off it, to what is opaque, 0 .. 67108864. 0: light goes
+    """Photons that bring light through traced glass, and off it, to what is opaque, 0 .. 16777216. 0: light goes
     straight through glass on its way, as it does through panes and all other models."""
     exposure: float = 0.0
     """Stops added to the camera's own exposure, -64 .. 64."""

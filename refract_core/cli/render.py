@@ -83,7 +83,7 @@ Caustics = Annotated[
     str | None,
     typer.Option(
         metavar="on|off|INTEGER",
-        help="Photons that carry light through glass, and off it, to other surfaces, 0 to 67108864. off, which draft "
+        help="Photons that carry light through glass, and off it, to other surfaces, 0 to 16777216. off, which draft "
         "has, lets light go straight through glass, tinted. The default is 65536, at best 262144.",
     ),
 ]
