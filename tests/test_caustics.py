@@ -136,7 +136,7 @@ def test_a_ball_focuses_as_two_refractions_say(ior: float) -> None:
     fov = 0.24
     lens = camera((0, min(0.3, (focus - radius) / 2), 0), (0, 0, 0), fov, orthographic=True)
     what = replace(lit(glass(Model.TRACED, ior), [ball], lights=(SUN,)), cameras=(lens,))
-    picture = draw(what, 96, 96, samples=16, tolerance=0.03, caustics=1 << 18)["beauty"][..., 1].astype(np.float64)
+    picture = draw(what, 96, 96, samples=16, tolerance=0.03, caustics=1 << 17)["beauty"][..., 1].astype(np.float64)
     bare = arriving(lit(WHITE, [], lights=(SUN,)))[..., 1].mean()
     places = (np.arange(96) + 0.5) / 48 * fov - fov
     away = np.hypot(places[:, None], places[None, :])
@@ -156,7 +156,7 @@ def test_each_colour_is_focused_by_its_own_index() -> None:
     what = replace(glass(Model.TRACED, ior), abbe=abbe)
     lens = camera((0, 0.05, 0), (0, 0, 0), fov, orthographic=True)
     of = replace(lit(what, [Sphere("/body", (0.0, focus, 0.0), radius, 1)], lights=(SUN,)), cameras=(lens,))
-    picture = draw(of, 64, 64, samples=16, tolerance=0.03, caustics=1 << 18)["beauty"].astype(np.float64)
+    picture = draw(of, 64, 64, samples=16, tolerance=0.03, caustics=1 << 17)["beauty"].astype(np.float64)
     places = (np.arange(64) + 0.5) / 32 * fov - fov
     near = np.hypot(places[:, None], places[None, :]) < 0.04
     ratio = picture[near][:, 2].sum() / picture[near][:, 0].sum()
