@@ -613,7 +613,8 @@ def test_prims_keep_their_names_in_texts() -> None:
 
 
 def lines_of(server: Server) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in server.log.read_text().splitlines()]
+    whole = server.log.read_text().rpartition("\n")[0]  # the last line may be on its way
+    return [json.loads(line) for line in whole.splitlines()]
 
 
 def test_each_request_is_a_line(tmp_path: Path) -> None:
@@ -625,7 +626,14 @@ def test_each_request_is_a_line(tmp_path: Path) -> None:
         assert re.fullmatch("[0-9a-f]{16}", odd.headers["x-request-id"])
         long = client.get("/livez", headers={"X-Request-ID": "x" * 129})
         assert len(long.headers["x-request-id"]) == 16
-        found = {line["request_id"]: line for line in lines_of(server) if "request_id" in line}
+        asked = {answer.headers["x-request-id"] for answer in (drawn, odd, long)}
+        found: dict[str, dict[str, Any]] = {}
+
+        def written() -> bool:  # a line comes after its answer, which the client may well have read before
+            found.update({line["request_id"]: line for line in lines_of(server) if "request_id" in line})
+            return asked <= set(found)
+
+        until(written)
         line = found["shop-1.2:3"]
         assert (line["method"], line["path"], line["status"]) == ("POST", "/v1/render", 200)
         assert line["bytes"] == len(drawn.content)
