@@ -257,6 +257,20 @@ def test_light_goes_straight_through_panes_and_what_throws_no_caustics(kind: str
     np.testing.assert_allclose((through / bare).mean((0, 1)), kept * colour**power, rtol=2e-3)
 
 
+@pytest.mark.parametrize("share", [0.25, 0.5])
+def test_what_is_there_by_chance_stops_its_share_of_what_glass_throws(share: float) -> None:
+    """A card of `presence` between a box of glass and the floor: photons toss for it, each for itself."""
+    card = quad("/card", [(-2, 0.45, 2), (2, 0.45, 2), (2, 0.45, -2), (-2, 0.45, -2)], 2)
+    there = replace(material("/there", OPACITY=share, DIFFUSE=0.0, SPECULAR=0.0, IOR=1.0), opacity_presence=True)
+    body = box("/body", (0.4, 0.2, 0.4), 1, centre=(0, 0.8, 0))
+    clear, covered = (
+        scene([FLOOR, body, *cards], [WHITE, glass(Model.TRACED, 1.0), there], cameras=(under(0.3),), lights=(SUN,))
+        for cards in ([], [card])
+    )
+    found = arriving(covered).mean() / arriving(clear).mean()
+    assert found == pytest.approx(1.0 - share, abs=0.02)
+
+
 def test_a_thing_before_a_lamp_is_dark_though_something_else_is_cut_out() -> None:
     """A card stops the sun, whether or not some material of the stage is a cut-out."""
     card = quad("/card", [(-0.3, 1, 0.3), (0.3, 1, 0.3), (0.3, 1, -0.3), (-0.3, 1, -0.3)])

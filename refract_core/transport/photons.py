@@ -275,6 +275,8 @@ def _start(
         own.part[slot] = sources.part[e]
         own.kind[slot] = 1 if sources.light[e] == lights.kind.shape[0] else 0
         clear_slot(scratch.cell, slot)
+        # What is there by chance is so for each photon by itself: as for a pixel of its own.
+        scratch.cell.x[slot], scratch.cell.y[slot], scratch.cell.sample[slot] = first + lane, 0, 0
         stack, direction = scratch.stack, row(own.to_light, lane)
         copy_ray(stack, count, in_air, 0)
         put(stack.origin, count, off_surface(row(own.point, lane), row(own.normal, lane), direction))
