@@ -68,7 +68,7 @@ MUTANTS = (
     Mutant("the eye enters the smallest body first", "transport/eye.py",
            "key=lambda body: -body[0]", "key=lambda body: body[0]"),
     Mutant("the eye is in no body", "transport/eye.py",
-           "mesh.triangles) > 0.5", "mesh.triangles) > 1.5"),
+           "encloses(mesh.points, mesh.triangles, eye)", "encloses(mesh.points, mesh.triangles, -eye)"),
     Mutant("the eye is in what a body's first face is of", "transport/eye.py",
            "mesh.materials[of_glass.argmax()]", "mesh.materials[0]"),
     # --- media
@@ -269,14 +269,16 @@ MUTANTS = (
     Mutant("photons fall through what stands before a light", "transport/photons.py",
            "flux = mul(row(own.brought, lane), row(own.arrives, lane))", "flux = row(own.brought, lane)", CAUSTICS),
     Mutant("glass that throws caustics lets light through, too", "world/tracing.py",
-           "if glass.casts[hit.part] != 0:", "if glass.casts[hit.part] > 1:", CAUSTICS),
+           "if world.glass.casts[hit.part] != 0:", "if world.glass.casts[hit.part] > 1:", CAUSTICS),
     Mutant("a body absorbs from the receiver on", "world/tracing.py",
            "length = hit.t - packet.begun[lane]", "length = hit.t", CAUSTICS),
     Mutant("walls on the way are clear", "world/tracing.py",
            "share = 1.0 - fresnel_dielectric(cosine, 1.0 / ior)", "share = 1.0", CAUSTICS),
     Mutant("a hole hides the glass before it", "world/tracing.py",
            "if packet.valid[lane] != 0:  # from where it began", "if False:  # from where it began", CAUSTICS),
-    Mutant("every sample tosses the same coin", "world/tracing.py", "sample * _GOLDEN % 1.0", "0.0 * sample", CAUSTICS),
+    Mutant("all photons toss the same coin", "transport/photons.py",
+           "scratch.cell.sample[slot] = first + lane, 0, 0", "scratch.cell.sample[slot] = 0, 0, 0", CAUSTICS),
+    Mutant("every sample tosses the same coin", "world/tracing.py", "packet.sample[lane] * _GOLDEN % 1.0", "0.0", CAUSTICS),
 )  # fmt: skip
 
 

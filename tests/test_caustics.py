@@ -173,8 +173,8 @@ def landed(of: Scene, photons: int) -> F64:
     settings = rc.RenderSettings(image_width=64, caustics=photons, jobs=1)
     geometry, bvh, slots = pack_geometry(of)
     world = world_of(
-        geometry, pack_materials(of.materials, slots), textures.pack(of.textures),
-        pack_lights(of, np.zeros(3)), environment.pack(of.environment), -1,
+        geometry, pack_materials(of.materials, slots, ""), textures.pack(of.textures),
+        pack_lights(of, np.zeros(3)), environment.pack(of.environment),
     )  # fmt: skip
     with ThreadPoolExecutor(1) as executor:
         work = Work(executor, lambda _share, _stage: None, lambda: False)

@@ -57,6 +57,16 @@ class Cone(NamedTuple):
 
 
 @inlined
+def sample_cosine(n: Vec, u1: float, u2: float) -> Vec:
+    """A direction over `n`, by the cosine: its density is the cosine over pi [1/sr]. `u1`, `u2`: 0 .. 1."""
+    x, y = frame(n)
+    r = math.sqrt(u1)
+    phi = 2.0 * math.pi * u2
+    z = math.sqrt(max(0.0, 1.0 - u1))
+    return add(add(scale(x, r * math.cos(phi)), scale(y, r * math.sin(phi))), scale(n, z))
+
+
+@inlined
 def ggx(n_dot_h: float, alpha: float) -> float:
     """Normal distribution D (Walter et al. 2007, eq. 33)."""
     a2 = alpha * alpha

@@ -10,7 +10,6 @@ import numpy as np
 from ..kernels.compile import is_compiled
 from ..kernels.lanes import by_address, scratch
 from ..kernels.sampling import pixel_offsets
-from ..models import BY_TOKEN
 from ..scene import Camera, Scene
 from ..settings import SCREEN_METHODS, TIERS, RenderSettings
 from ..transport.corners import PATCH, CornerScratch, Refining, corner_tile
@@ -57,8 +56,7 @@ class Tree:
         self.ready, self.camera, self.settings, self.tiles, self.planes = ready, camera, settings, tiles, planes
         self.order = np.array([TIERS.index(t) for t in settings.tiers], np.int32)
         self.method = SCREEN_METHODS.index(settings.screen)
-        model = int(BY_TOKEN[settings.model]) if settings.model else -1
-        self.rules = by_address(Rules(model, settings.max_layers, settings.cut, settings.screen != "proxy"))
+        self.rules = by_address(Rules(settings.max_layers, settings.cut, settings.screen != "proxy"))
         self.view_ray = by_address(view_ray(scene, camera, settings.model))
         self.by_corners = settings.by_corners
         self.size = (width, height)

@@ -13,18 +13,29 @@ from ..models import Behind, Model
 from ..scene import F64, Camera, LightKind, Scene
 from ..settings import RenderSettings
 from ..transport.crossing import Rules
-from ..transport.photons import BANDS, SECTORS, Landings, PhotonScratch, Sources, photon_batch, weigh_sources
-from ..transport.rays import ALL_CHANNELS, Rays, new_rays
+from ..transport.photons import BANDS, SECTORS, PhotonScratch, Sources, photon_batch, weigh_sources
+from ..transport.rays import ray_in_air
 from ..transport.tree import TreeScratch
 from ..view.camera import image_size
-from ..world.caustics import LEVELS, Caustics, add_photons, count_photons, new_caustics, no_caustics, raise_levels
-from ..world.solid import winding
+from ..world.caustics import (
+    LEVELS,
+    Caustics,
+    Landings,
+    add_photons,
+    count_photons,
+    new_caustics,
+    new_tally,
+    no_caustics,
+    raise_levels,
+)
+from ..world.solid import encloses
 from ..world.tables import GlassShade, World
 from .work import Work
 
 _CUT = 0.01
 """Weight below which a photon's branch is given to its sibling: a tenth gains nothing, and costs a third more."""
 _LAYERS = 32
+"""Surfaces that a photon may enter, whatever the picture's own limit is: light must get out."""
 _BATCH = 1024
 """Photons that a thread follows at once."""
 _WANTED = 4.0
@@ -37,6 +48,7 @@ _PLATE = 0.9
 """Part of a body's surface that looks one way or the opposite, from which on it is a plate, which
 light leaves as it came."""
 _MOST_SOURCES = 1 << 20
+"""Pieces of glass that are weighed for themselves, for all lights together."""
 _BENDING = [int(model) for model in Model if model.behind in (Behind.MESH, Behind.BALL)]
 
 
@@ -47,16 +59,16 @@ class Thrown(NamedTuple):
     table: Caustics
 
 
-def throws_caustics(world: World) -> NDArray[np.bool_]:
+def _throws_caustics(world: World) -> NDArray[np.bool_]:
     """Which parts are bodies of glass that bend light: closed, and no plates, nor slabs by their model. Shape (G,)."""
-    geometry, materials, glass = world.geometry, world.materials, world.glass
+    geometry, materials = world.geometry, world.materials
     casts = np.zeros(len(geometry.thing), np.bool_)
     for g in range(len(casts)):
         used = np.unique(geometry.material[_rows(world, g)])
         own = materials.model[used]
         refractive = own.size > 0 and bool((own != 0).all()) and not materials.cutout[used].any()
-        models = own if glass.model < 0 else np.array([glass.model])
-        if refractive and not geometry.sheet[g] and bool(np.isin(models, _BENDING).all()):
+        bends = bool(np.isin(materials.drawn[used], _BENDING).all())
+        if refractive and bends and not geometry.sheet[g]:
             casts[g] = geometry.sphere[g, 3] > 0.0 or not _is_plate(world, g)
     return casts
 
@@ -74,9 +86,14 @@ def _corners(world: World, part: int) -> F64:
     return corners
 
 
+def _across(corners: F64) -> F64:
+    """Normals of triangles, twice as long as their areas. Shape (T, 3)."""
+    normals: F64 = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return normals
+
+
 def _is_plate(world: World, part: int) -> bool:
-    corners = _corners(world, part)
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across = _across(_corners(world, part))
     area = np.linalg.norm(across, axis=1)
     if not area.any():
         return True
@@ -126,8 +143,7 @@ def _pieces(world: World, casts: NDArray[np.bool_]) -> tuple[NDArray[np.int64], 
         else:
             corners = _corners(world, int(g))
             order = _along_a_curve(corners.mean(axis=1))
-            across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            area = 0.5 * np.linalg.norm(across, axis=1)[order]
+            area = 0.5 * np.linalg.norm(_across(corners), axis=1)[order]
         found.append((np.full(len(order), g), order, area))
     parts, primitives, areas = (np.concatenate(column) for column in zip(*found, strict=True))
     return parts, primitives, areas
@@ -157,9 +173,7 @@ def _bodies_around(world: World, scene: Scene, light: int, parts: NDArray[np.int
             if math.dist(at, world.geometry.sphere[g, :3]) < world.geometry.sphere[g, 3]:
                 found.append(int(g))
             continue
-        mesh = scene.meshes[thing]
-        near = ((mesh.points.min(axis=0) < at) & (at < mesh.points.max(axis=0))).all()
-        if near and winding(at, mesh.points.astype(np.float64), mesh.triangles) > 0.5:
+        if encloses(scene.meshes[thing].points, scene.meshes[thing].triangles, at):
             found.append(int(g))
     return found
 
@@ -217,7 +231,7 @@ def plan_caustics(world: World, camera: Camera, settings: RenderSettings) -> Wan
     """
     if settings.caustics == 0 or not _shadowing(world):
         return None
-    casts = throws_caustics(world)
+    casts = _throws_caustics(world)
     if not casts.any() or (world.materials.model[world.geometry.material] != 0).all():
         return None
     width, _ = image_size(camera, settings.image_width, settings.image_height)
@@ -229,7 +243,7 @@ def caustics_of(world: World, scene: Scene, wanted: Wanted | None, work: Work) -
     if wanted is None:
         return None
     walked = bool(_glass_parts(world)[~wanted.casts].any())
-    glass = GlassShade(wanted.casts.astype(np.uint8), walked, world.glass.model)
+    glass = GlassShade(wanted.casts.astype(np.uint8), walked)
     return Thrown(glass, _table(world._replace(glass=glass), scene, wanted, work))
 
 
@@ -255,8 +269,8 @@ def _table(world: World, scene: Scene, wanted: Wanted, work: Work) -> Caustics:
     flux += 1e-3 * flux.sum() * sources.area / sources.area.sum()
     cdf = np.concatenate([[0.0], np.cumsum(flux) / flux.sum()])
     cdf[-1] = 1.0
-    rules = by_address(Rules(world.glass.model, _LAYERS, _CUT, True))
-    in_air = by_address(_ray_in_air())
+    rules = by_address(Rules(_LAYERS, _CUT, True))
+    in_air = by_address(ray_in_air())
 
     def follow(first: int) -> Landings:
         room = 8 * _BATCH
@@ -279,30 +293,21 @@ def _table(world: World, scene: Scene, wanted: Wanted, work: Work) -> Caustics:
     return _written(landings, wanted) if len(landings.part) else no_caustics()
 
 
-def _ray_in_air() -> Rays:
-    ray = new_rays(1)
-    ray.weight[:] = ray.clear[:] = 1.0
-    ray.end[:] = math.inf
-    ray.channel[:], ray.thing[:] = ALL_CHANNELS, -1
-    return ray
-
-
 def _written(landings: Landings, wanted: Wanted) -> Caustics:
     """Landings in a table that is large enough."""
-    texel, finest = wanted.texel, wanted.finest
+    texel, finest, landed = wanted.texel, wanted.finest, by_address(landings)
     count = len(landings.part)
     slots = 1 << max(10, math.ceil(math.log2(count)))
     levels, limits, level, left = np.zeros(count, np.int32), finest[landings.part], 0, count
     while left > 0:
-        table = by_address(new_caustics(slots, texel, 6))
-        if not count_photons(table, landings.point, landings.normal, landings.flux, landings.kind, levels, level):
+        tally = by_address(new_tally(slots))
+        if not count_photons(tally, landed, texel[level], levels, level):
             slots *= 2
             continue
-        places = landings.point, landings.normal, landings.kind
-        left = raise_levels(table, *places, limits, _WANTED, levels, level)
+        left = raise_levels(tally, landed, texel[level], limits, _WANTED, levels, level)
         level += 1
     while True:
         table = new_caustics(slots, texel)
-        if add_photons(by_address(table), landings.point, landings.normal, landings.flux, levels) == count:
+        if add_photons(by_address(table), landed, levels):
             return table
         slots *= 2

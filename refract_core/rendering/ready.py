@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from ..errors import UsageError
 from ..kernels.lanes import by_address
-from ..models import BY_TOKEN
 from ..probes.capture import Over, Run, cubemap_of, fill_table
 from ..probes.lookup import ProbeTable, empty_table
 from ..probes.plan import Entry, Plan, plan_capture, plan_picture
@@ -99,11 +98,10 @@ def _prepare(
     geometry, bvh, slots = pack_geometry(scene, chosen.captured_sets)
     plain = world_of(
         geometry,
-        pack_materials(scene.materials, slots),
+        pack_materials(scene.materials, slots, settings.model),
         textures.pack(scene.textures),
         pack_lights(scene, camera.world_from_camera[:3, 3]),
         environment.pack(scene.environment),
-        _model(settings),
     )
     thrown = caustics_of(plain, scene, plan_caustics(plain, camera, settings), work)
     world = by_address(with_caustics(plain, thrown))
@@ -112,11 +110,6 @@ def _prepare(
     work.progress(span[0], "probes")
     rays = fill_table(table, entries, world, _runner(work, span), samples, over and over(world, bvh))
     return Ready(world, bvh, table, chosen.thing_probe, rays, chosen.notices)
-
-
-def _model(settings: RenderSettings) -> int:
-    """As `GlassShade.model`."""
-    return int(BY_TOKEN[settings.model]) if settings.model else -1
 
 
 def _runner(work: Work, span: tuple[float, float]) -> Run:
@@ -154,9 +147,9 @@ def _from_parts(
     images = session.part("textures", scene.textures, lambda: textures.pack(scene.textures))
     sky = session.part("environment", scene.environment, lambda: environment.pack(scene.environment))
     geometry, bvh, slots = hierarchy.made
-    materials = pack_materials(scene.materials, slots)
+    materials = pack_materials(scene.materials, slots, settings.model)
     lights = pack_lights(scene, camera.world_from_camera[:3, 3])
-    plain = world_of(geometry, materials, images.made, lights, sky.made, _model(settings))
+    plain = world_of(geometry, materials, images.made, lights, sky.made)
     wanted_light = plan_caustics(plain, camera, settings)
     fallen = hierarchy.number, images.number, sky.number, tuple(lights), scene.materials, settings.model, wanted_light
     thrown = session.part("caustics", fallen, lambda: caustics_of(plain, scene, wanted_light, work))

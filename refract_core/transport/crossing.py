@@ -17,10 +17,10 @@ from ..kernels.lanes import Column, Flags, Scalars, Vectors, Words, put
 from ..kernels.sampling import GLANCED, THROUGH, hash32
 from ..kernels.vec import Vec, dot, flip_towards, mul, normalize, row, scale, sub
 from ..optics.interface import fresnel_dielectric, reflect, refract, transmittance, transmitted_roughness
-from ..optics.models import absorption_distance_of, exit_of, is_sheet, is_walked, on_open_mesh, thickness_of
+from ..optics.models import absorption_distance_of, exit_of, is_sheet, is_walked, thickness_of
 from ..scene import Param
 from ..world.offsets import off_surface, past
-from ..world.surface import Interaction, color_input, float_input, normal_input, share_input
+from ..world.surface import Interaction, color_input, drawn_model, float_input, normal_input, share_input
 from ..world.tables import World
 from .rays import (
     AIR,
@@ -59,8 +59,6 @@ Directions = Annotated[NDArray[np.float64], Column(np.float64, (3, 3))]
 class Rules(NamedTuple):
     """What holds for every ray of a picture."""
 
-    model: int
-    """a `scene.Model` for every refractive material, or -1 for their own"""
     max_layers: int
     """surfaces entered after which a ray in air sees no more glass"""
     cut: float
@@ -123,15 +121,12 @@ class Meeting(NamedTuple):
 
 
 @inlined
-def meet(meeting: Meeting, lane: int, now: Rays, at: Interaction, world: World, rules: Rules) -> None:
+def meet(meeting: Meeting, lane: int, now: Rays, at: Interaction, world: World) -> None:
     """Say what the glass at a hit is to a ray, and look up its attributes. Bodies that fill no space are noted, and the
     way to the hit is absorbed along."""
     geometry, materials, hit, media = world.geometry, world.materials, at.hit, now.media
     m, thing = hit.material, geometry.thing[hit.part]
-    model = materials.model[m] if rules.model < 0 else rules.model
-    open_mesh = geometry.sheet[hit.part] != 0
-    if open_mesh:
-        model = on_open_mesh(model)
+    model, open_mesh = drawn_model(world, hit), geometry.sheet[hit.part] != 0
     outer = dot(at.ng, row(now.direction, lane)) < 0.0
     slot = slot_of(media, lane, thing)
     room = media.depth[lane] < MOST_MEDIA

@@ -8,8 +8,8 @@ import numpy as np
 
 from ..models import BY_TOKEN, Behind
 from ..scene import Camera, Material, Param, Scene
-from ..world.solid import winding
-from .rays import ALL_CHANNELS, MOST_MEDIA, VIEW, Rays, add_medium, new_rays
+from ..world.solid import encloses
+from .rays import MOST_MEDIA, Rays, add_medium, ray_in_air
 
 
 def view_ray(scene: Scene, camera: Camera, model: str) -> Rays:
@@ -22,10 +22,7 @@ def view_ray(scene: Scene, camera: Camera, model: str) -> Rays:
     Args:
         model: token that overrides all materials' models, or ''.
     """
-    ray = new_rays(1)
-    ray.weight[:] = ray.clear[:] = 1.0
-    ray.end[:] = math.inf
-    ray.channel[:], ray.side[:], ray.thing[:] = ALL_CHANNELS, VIEW, -1
+    ray = ray_in_air()
     if camera.orthographic:
         return ray
     eye = camera.world_from_camera[:3, 3]
@@ -33,12 +30,9 @@ def view_ray(scene: Scene, camera: Camera, model: str) -> Rays:
     around: list[tuple[float, int, Material]] = []
     for thing, mesh in enumerate(scene.meshes):
         of_glass = traced[mesh.materials]
-        if mesh.closed and of_glass.any():
-            low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
-            near = ((low < eye) & (eye < high)).all()
-            if near and winding(eye, mesh.points.astype(np.float64), mesh.triangles) > 0.5:
-                filled_with = scene.materials[mesh.materials[of_glass.argmax()]]
-                around.append((float(np.prod(high - low)), thing, filled_with))
+        if mesh.closed and of_glass.any() and encloses(mesh.points, mesh.triangles, eye):
+            filled_with = scene.materials[mesh.materials[of_glass.argmax()]]
+            around.append((float(np.prod(np.ptp(mesh.points, axis=0))), thing, filled_with))
     for k, ball in enumerate(scene.spheres):
         if traced[ball.material] and math.dist(ball.centre, eye) < ball.radius:
             around.append(((2.0 * ball.radius) ** 3, len(scene.meshes) + k, scene.materials[ball.material]))

@@ -21,15 +21,16 @@ from ..kernels.arrays import F64_1D, F64_2D, I32_1D
 from ..kernels.compile import inlined, kernel
 from ..kernels.lanes import LANES, Vectors, put
 from ..kernels.sampling import Key, Purpose, unit_pair
-from ..kernels.vec import Vec, add, cross, dot, flip_towards, frame, mul, normalize, row, scale, sub
-from ..optics.lobes import MIRROR_ALPHA, sample_half_vector
+from ..kernels.vec import Vec, add, cross, dot, flip_towards, mul, normalize, row, scale, sub
+from ..optics.lobes import MIRROR_ALPHA, sample_cosine, sample_half_vector
 from ..scene import LightKind, Model
+from ..world.caustics import Landings
 from ..world.embree import OPAQUE, clear
 from ..world.environment import TEXEL_LUMINANCE, direction_pdf, irradiance, radiance, sample_direction
 from ..world.lights import irradiance_factor, shadow_ray
 from ..world.offsets import off_surface
 from ..world.shaping import shape_drawn, shape_matt
-from ..world.surface import NOTHING, Ray, corners_of, interaction, kept_hit
+from ..world.surface import NOTHING, Interaction, Ray, corners_of, interaction, kept_hit
 from ..world.tables import World
 from ..world.tracing import add_shadow_ray, visible
 from .crossing import PASSED, Rules, meet, send_mirrored, send_out, send_past, send_through
@@ -59,30 +60,13 @@ class Sources(NamedTuple):
     """shape (E,): its flux if nothing stands in the way, by luminance, about; `weigh_sources` fills it"""
 
 
-class Landings(NamedTuple):
-    """Where photons have ended: as many rows as there was room for."""
-
-    point: F64_2D
-    """[m]"""
-    normal: F64_2D
-    """unit geometric normal, on the side that it came from"""
-    flux: F64_2D
-    """[radiance * sr * m^2]"""
-    part: I32_1D
-    """of the glass that it came by first"""
-    kind: I32_1D
-    """0 from a lamp, 1 from the sky"""
-
-
 class PhotonScratch(NamedTuple):
     """What one thread needs for a cell of photons."""
 
     flux: F64_2D
     """shape (64, 3)"""
-    part: I32_1D
-    """shape (64,)"""
-    kind: I32_1D
-    """shape (64,)"""
+    source: I32_1D
+    """shape (64,): row of `Sources`"""
     point: Vectors
     """where the eight photons start that are asked for their light [m]"""
     normal: Vectors
@@ -92,15 +76,13 @@ class PhotonScratch(NamedTuple):
     """flux if nothing stands in the way"""
     arrives: Vectors
     """share of it, colour by colour"""
-    source: I32_1D
 
     @staticmethod
     def fresh() -> PhotonScratch:
         """All of it at zero."""
         return PhotonScratch(
-            np.zeros((CELL, 3)), np.zeros(CELL, np.int32), np.zeros(CELL, np.int32), np.zeros((LANES, 3)),
-            np.zeros((LANES, 3)), np.zeros((LANES, 3)), np.zeros((LANES, 3)), np.zeros((LANES, 3)),
-            np.zeros(LANES, np.int32),
+            np.zeros((CELL, 3)), np.zeros(CELL, np.int32), np.zeros((LANES, 3)), np.zeros((LANES, 3)),
+            np.zeros((LANES, 3)), np.zeros((LANES, 3)), np.zeros((LANES, 3)),
         )  # fmt: skip
 
 
@@ -159,8 +141,8 @@ def _place_at(world: World, sources: Sources, e: int, a: float, b: float) -> tup
         r = math.sqrt(max(0.0, 1.0 - z * z))
         n = (r * math.cos(phi), r * math.sin(phi), z)
         return add(row(geometry.sphere, part), scale(n, np.float64(geometry.sphere[part, 3]))), scale(n, side)
-    p, q, r_ = corners_of(geometry, part, sources.primitive[e])
-    pq, pr = sub(q, p), sub(r_, p)
+    p, q, last = corners_of(geometry, part, sources.primitive[e])
+    pq, pr = sub(q, p), sub(last, p)
     return add(p, add(scale(pq, a), scale(pr, b))), scale(normalize(cross(pq, pr)), side)
 
 
@@ -191,19 +173,12 @@ def _direction_of_sky(world: World, n: Vec, k: int, u1: float, u2: float) -> tup
     """A direction to the sky, every other one by the cosine, the rest by radiance, and the irradiance it stands for
     (Veach's balance heuristic)."""
     sky = world.environment
-    even = sky.even
-    if even or k % 2 == 0:
-        x, y = frame(n)
-        r, phi = math.sqrt(u1), 2.0 * math.pi * u2
-        z = math.sqrt(max(0.0, 1.0 - u1))
-        d = add(add(scale(x, r * math.cos(phi)), scale(y, r * math.sin(phi))), scale(n, z))
-    else:
-        d = sample_direction(sky, u1, u2)[0]
+    d = sample_cosine(n, u1, u2) if sky.even or k % 2 == 0 else sample_direction(sky, u1, u2)[0]
     cosine = dot(d, n)
     if cosine <= 0.0:
         return n, (0.0, 0.0, 0.0)
     density = cosine / math.pi
-    if not even:
+    if not sky.even:
         density = 0.5 * density + 0.5 * direction_pdf(sky, d)[0]
     return d, scale(radiance(sky, d, 0.0), cosine / density)
 
@@ -231,7 +206,7 @@ def photon_batch(
         for begin in range(start, min(start + CELL, last), LANES):
             end = min(begin + LANES, last)
             count = _start(world, sources, cdf, in_air, scratch, own, begin, end, start, total, count)
-        landed = _follow(world, rules, scratch, own, count, start, landings, landed)
+        landed = _follow(world, sources, rules, scratch, own, count, start, landings, landed)
     return landed
 
 
@@ -261,7 +236,7 @@ def _start(
         put(own.normal, lane, n)
         put(own.to_light, lane, direction)
         put(own.brought, lane, scale(brought, sources.area[e] / (chance * total)))
-        own.source[lane] = e
+        own.source[k - cell] = e
         if max(brought[0], brought[1], brought[2]) > 0.0 and dot(direction, n) > 0.0:
             add_shadow_ray(packet, lane, p, n, direction, distance)
     visible(packet, world, OPAQUE, own.arrives)
@@ -271,9 +246,6 @@ def _start(
             continue
         slot = first + lane - cell
         put(own.flux, slot, flux)
-        e = own.source[lane]
-        own.part[slot] = sources.part[e]
-        own.kind[slot] = 1 if sources.light[e] == lights.kind.shape[0] else 0
         clear_slot(scratch.cell, slot)
         # What is there by chance is so for each photon by itself: as for a pixel of its own.
         scratch.cell.x[slot], scratch.cell.y[slot], scratch.cell.sample[slot] = first + lane, 0, 0
@@ -288,8 +260,8 @@ def _start(
 
 @inlined
 def _follow(
-    world: World, rules: Rules, scratch: TreeScratch, own: PhotonScratch, count: int, first: int, landings: Landings,
-    landed: int,
+    world: World, sources: Sources, rules: Rules, scratch: TreeScratch, own: PhotonScratch, count: int, first: int,
+    landings: Landings, landed: int,
 ) -> int:  # fmt: skip
     """Follow the `count` photons on the stack, and what becomes of them. Returns the number of landings."""
     stack, now, met, meeting = scratch.stack, scratch.now, scratch.met, scratch.meeting
@@ -310,10 +282,10 @@ def _follow(
             if world.materials.model[hit.material] == Model.NONE.value:
                 absorb(now, lane, hit.t)
                 if landed < landings.part.shape[0]:
-                    _land(landings, landed, own, now, lane, at.point, at.ng)
+                    _land(landings, landed, world, sources, own, now, lane, at)
                 landed += 1
                 continue
-            meet(meeting, lane, now, at, world, rules)
+            meet(meeting, lane, now, at, world)
             if meeting.kind[lane] == PASSED:
                 count = send_past(stack, count, now, lane, hit.t)
                 continue
@@ -329,10 +301,15 @@ def _follow(
 
 
 @inlined
-def _land(landings: Landings, k: int, own: PhotonScratch, now: Rays, lane: int, point: Vec, ng: Vec) -> None:
+def _land(
+    landings: Landings, k: int, world: World, sources: Sources, own: PhotonScratch, now: Rays, lane: int,
+    at: Interaction,
+) -> None:  # fmt: skip
     slot = now.pixel[lane]
-    put(landings.point, k, point)
-    put(landings.normal, k, flip_towards(ng, scale(row(now.direction, lane), -1.0)))
+    e = own.source[slot]
+    put(landings.point, k, at.point)
+    put(landings.normal, k, flip_towards(at.ng, scale(row(now.direction, lane), -1.0)))
     put(landings.flux, k, mul(row(own.flux, slot), row(now.weight, lane)))
-    landings.part[k], landings.kind[k] = own.part[slot], own.kind[slot]
+    landings.part[k] = sources.part[e]
+    landings.kind[k] = 1 if sources.light[e] == world.lights.kind.shape[0] else 0
 

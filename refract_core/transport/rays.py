@@ -5,6 +5,7 @@ A record holds many, row by row. `now` in the other rooms of this wing is such a
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -119,6 +120,15 @@ def new_rays(count: int) -> Rays:
     fields = {name: numbers(3) for name in vectors} | {name: numbers() for name in lengths}
     made: list[Any] = [fields[name] if name in fields else words() for name in Rays._fields[:-1]]
     return Rays._make([*made, media])
+
+
+def ray_in_air() -> Rays:
+    """One row: a ray of the whole light in air, without place or direction."""
+    ray = new_rays(1)
+    ray.weight[:] = ray.clear[:] = 1.0
+    ray.end[:] = math.inf
+    ray.channel[:], ray.side[:], ray.thing[:] = ALL_CHANNELS, VIEW, -1
+    return ray
 
 
 @inlined

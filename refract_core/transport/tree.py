@@ -324,7 +324,7 @@ def _meet_all(scratch: TreeScratch, world: World, view: View, rules: Rules, take
             cell.part[now.pixel[lane]] = hit.part
         wide = cell.spread[now.pixel[lane]] * (now.travelled[lane] + hit.t)
         at = interaction(world.geometry, hit, Ray(row(now.origin, lane), direction), wide)
-        meet(meeting, lane, now, at, world, rules)
+        meet(meeting, lane, now, at, world)
         scratch.state[lane] = _MET
         if meeting.kind[lane] == PASSED:
             continue

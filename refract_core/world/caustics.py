@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..kernels.arrays import F32_2D, F64_1D, F64_2D, I32_1D, I64_1D
+from ..kernels.arrays import F32_1D, F32_2D, F64_1D, F64_2D, I32_1D, I64_1D
 from ..kernels.compile import inlined, kernel
 from ..kernels.vec import Vec, along, dot, length, row
 from ..scene import F32
@@ -60,11 +60,45 @@ def no_caustics() -> Caustics:
     return new_caustics(1, np.zeros(0))
 
 
-def new_caustics(slots: int, texel: F64_1D, columns: int = 3) -> Caustics:
-    """An empty table. `slots`: a power of two; `columns`: 6 for `count_photons`."""
-    flux: F32 = np.zeros((slots, columns), np.float32)
+def new_caustics(slots: int, texel: F64_1D) -> Caustics:
+    """An empty table. `slots`: a power of two."""
+    flux: F32 = np.zeros((slots, 3), np.float32)
     keys, marks = np.full(slots, _EMPTY, np.int64), np.zeros(slots, np.int32)
     return Caustics(keys, flux, marks, texel, np.full(3, math.inf), np.full(3, -math.inf))
+
+
+class Landings(NamedTuple):
+    """Where photons have ended: as many rows as there was room for."""
+
+    point: F64_2D
+    """[m]"""
+    normal: F64_2D
+    """unit geometric normal, on the side that it came from"""
+    flux: F64_2D
+    """[radiance * sr * m^2]"""
+    part: I32_1D
+    """of the glass that it came by first"""
+    kind: I32_1D
+    """0 from a lamp, 1 from the sky"""
+
+
+class Tally(NamedTuple):
+    """What has come to the texels of one level, kind by kind: a hash table as `Caustics` is."""
+
+    keys: I64_1D
+    light: F32_1D
+    """shape (H,): sum of luminances of flux; the next of their squares"""
+    squares: F32_1D
+    number: F32_1D
+    """of photons"""
+    normal: F32_2D
+    """shape (H, 3): sum of theirs"""
+
+
+def new_tally(slots: int) -> Tally:
+    """An empty one. `slots`: a power of two."""
+    light, squares, number = (np.zeros(slots, np.float32) for _ in range(3))
+    return Tally(np.full(slots, _EMPTY, np.int64), light, squares, number, np.zeros((slots, 3), np.float32))
 
 
 # --- addresses ----------------------------------------------------------------------------------------------------
@@ -99,6 +133,21 @@ def _slot(keys: I64_1D, key: int) -> int:
 
 
 @inlined
+def _claim(keys: I64_1D, key: int) -> tuple[int, int]:
+    """The slot of a key, which is its own from now on; and 1 if it was free."""
+    slot = _slot(keys, key)
+    new = 1 if keys[slot] == _EMPTY else 0
+    keys[slot] = key
+    return slot, new
+
+
+@inlined
+def _is_full(keys: I64_1D, filled: int) -> bool:
+    """Half of a table's slots are taken, from where on finding a key takes long; then it is of no use."""
+    return 2 * filled > keys.shape[0]
+
+
+@inlined
 def _main_axis(n: Vec) -> int:
     x, y, z = abs(n[0]), abs(n[1]), abs(n[2])
     return 0 if x >= y and x >= z else (1 if y >= z else 2)
@@ -113,71 +162,68 @@ def _side_of(n: Vec, axis: int) -> int:
 
 
 @kernel
-def count_photons(
-    table: Caustics, points: F64_2D, normals: F64_2D, flux: F64_2D, kinds: I32_1D, levels: I32_1D, level: int
-) -> bool:
-    """Sum up the photons that have come to a level in its texels, kind by kind: in the place of flux their luminance,
-    its square, their number, and their normals. False if the table is half full; then it is of no use."""
+def count_photons(tally: Tally, landings: Landings, texel: float, levels: I32_1D, level: int) -> bool:
+    """Sum up the photons that have come to a level in its texels. False if the table became too full.
+
+    Args:
+        texel: size of the level's texels [m].
+        levels: shape (N,): where photons have come to.
+    """
     filled = 0
-    for k in range(points.shape[0]):
+    for k in range(landings.part.shape[0]):
         if levels[k] != level:
             continue
-        n = row(normals, k)
+        n = row(landings.normal, k)
         axis = _main_axis(n)
-        u, v, w = _coordinates(row(points, k), axis, table.texel[level])
-        key = _key(level, _side_of(n, axis) + 8 * kinds[k], math.floor(u), math.floor(v), math.floor(w))
-        slot = _slot(table.keys, key)
-        if table.keys[slot] == _EMPTY:
-            filled += 1
-            if 2 * filled > table.keys.shape[0]:
-                return False
-            table.keys[slot] = key
-        light = dot(row(flux, k), TEXEL_LUMINANCE)
-        table.flux[slot, 0] += light
-        table.flux[slot, 1] += light * light
-        table.flux[slot, 2] += 1.0
+        u, v, w = _coordinates(row(landings.point, k), axis, texel)
+        side = _side_of(n, axis) + 8 * landings.kind[k]
+        slot, new = _claim(tally.keys, _key(level, side, math.floor(u), math.floor(v), math.floor(w)))
+        filled += new
+        if _is_full(tally.keys, filled):
+            return False
+        light = dot(row(landings.flux, k), TEXEL_LUMINANCE)
+        tally.light[slot] += light
+        tally.squares[slot] += light * light
+        tally.number[slot] += 1.0
         for c in range(3):
-            table.flux[slot, 3 + c] += n[c]
+            tally.normal[slot, c] += n[c]
     return True
 
 
 @kernel
 def raise_levels(
-    table: Caustics, points: F64_2D, normals: F64_2D, kinds: I32_1D, finest: I32_1D, wanted: float, levels: I32_1D,
-    level: int,
-) -> int:  # fmt: skip
+    tally: Tally, landings: Landings, texel: float, finest: I32_1D, wanted: float, levels: I32_1D, level: int
+) -> int:
     """Let photons of a level go on to the next, whose texels are a quarter as large, where these have `wanted` of them:
     as many of equal flux as would be as even (Kish, "Survey Sampling", 1965: the effective size of a sample). On
     what bends inside of a texel a quarter is enough: noise is better than light that has gone astray.
 
     Args:
-        table: of `count_photons`.
-        kinds: shape (N,): 0 or 1; those of another kind are not counted.
+        tally: of `count_photons`; those of another kind are not counted.
         finest: shape (N,): levels that they may not go beyond.
-        levels: shape (N,): where they have come to.
 
     Returns:
         How many went on.
     """
     went = 0
-    for k in range(points.shape[0]):
+    for k in range(landings.part.shape[0]):
         if levels[k] != level or finest[k] <= level:
             continue
-        n = row(normals, k)
+        n = row(landings.normal, k)
         axis = _main_axis(n)
-        u, v, w = _coordinates(row(points, k), axis, table.texel[level])
+        u, v, w = _coordinates(row(landings.point, k), axis, texel)
+        side = _side_of(n, axis) + 8 * landings.kind[k]
         column, line, layer = math.floor(u), math.floor(v), math.floor(w)
         light = squares = number = 0.0
         mean = (0.0, 0.0, 0.0)
         for i in range(-1, 2):
             for j in range(-1, 2):
-                key = _key(level, _side_of(n, axis) + 8 * kinds[k], column + i, line + j, layer)
-                slot = _slot(table.keys, key)
+                slot = _slot(tally.keys, _key(level, side, column + i, line + j, layer))
                 share = _FILTER[i + 1] * _FILTER[j + 1]
-                light += share * table.flux[slot, 0]
-                squares += share * table.flux[slot, 1]
-                number += share * table.flux[slot, 2]
-                mean = along(mean, (table.flux[slot, 3], table.flux[slot, 4], table.flux[slot, 5]), share)
+                light += share * tally.light[slot]
+                squares += share * tally.squares[slot]
+                number += share * tally.number[slot]
+                mean = along(mean, row(tally.normal, slot), share)
         bent = length(mean) < _FLAT * number
         if light * light >= (wanted if bent else 4.0 * wanted) * squares:
             levels[k] = level + 1
@@ -186,14 +232,11 @@ def raise_levels(
 
 
 @kernel
-def add_photons(
-    table: Caustics, points: F64_2D, normals: F64_2D, flux: F64_2D, levels: I32_1D
-) -> int:
-    """Write photons into a table. Returns how many were written: fewer than there are if it is half full, and then it
-    is of no use."""
+def add_photons(table: Caustics, landings: Landings, levels: I32_1D) -> bool:
+    """Write photons into a table. False if it became too full."""
     filled = 0
-    for k in range(points.shape[0]):
-        n, p = row(normals, k), row(points, k)
+    for k in range(landings.part.shape[0]):
+        n, p = row(landings.normal, k), row(landings.point, k)
         texel = table.texel[levels[k]]
         for axis in range(3):
             table.low[axis] = min(table.low[axis], p[axis] - 3.0 * texel)
@@ -207,16 +250,14 @@ def add_photons(
                 i, j = corner % 2, corner // 2
                 share = (s if i else 1.0 - s) * (t if j else 1.0 - t)
                 key = _key(levels[k], _side_of(n, axis), column + i, line + j, math.floor(w))
-                slot = _slot(table.keys, key)
-                if table.keys[slot] == _EMPTY:
-                    filled += 1
-                    if 2 * filled > table.keys.shape[0]:
-                        return k
-                    table.keys[slot] = key
-                    filled += _mark(table, column + i, line + j, w, _side_of(n, axis), levels[k])
+                slot, new = _claim(table.keys, key)
+                if new != 0:
+                    filled += 1 + _mark(table, column + i, line + j, w, _side_of(n, axis), levels[k])
+                    if _is_full(table.keys, filled):
+                        return False
                 for c in range(3):
-                    table.flux[slot, c] += share * flux[k, c]
-    return points.shape[0]
+                    table.flux[slot, c] += share * landings.flux[k, c]
+    return True
 
 
 @inlined
@@ -226,16 +267,14 @@ def _mark(table: Caustics, column: int, line: int, w: float, side: int, level: i
     share = table.texel[level] / table.texel[0]
     u, v, w = (column + 0.5) * share, (line + 0.5) * share, (math.floor(w) + 0.5) * share
     reach = 2.0 * share  # of the filter
-    new = 0
+    marked = 0
     for i in range(math.floor(u - reach), math.floor(u + reach) + 1):
         for j in range(math.floor(v - reach), math.floor(v + reach) + 1):
             for k in range(math.floor(w - 1.5 * share), math.floor(w + 1.5 * share) + 1):
-                slot = _slot(table.keys, _key(_MARK, side, i, j, k))
-                if table.keys[slot] == _EMPTY:
-                    new += 1
-                    table.keys[slot] = _key(_MARK, side, i, j, k)
+                slot, new = _claim(table.keys, _key(_MARK, side, i, j, k))
+                marked += new
                 table.marks[slot] |= 1 << level
-    return new
+    return marked
 
 
 # --- reading ------------------------------------------------------------------------------------------------------

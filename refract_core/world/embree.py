@@ -212,10 +212,11 @@ class Packet(NamedTuple):
     """`valid` as the caller of `tracing.intersect_world` set it, while it looks behind cut-outs"""
     chance: Flags
     """1 where the ray of a lane met a surface that is there by chance, or not (`tracing.intersect_world`)"""
-    pixel: Words
-    """bits that stand for the pixel a ray belongs to"""
-    turn: Scalars
-    """of its sample, 0 .. 1: what `tracing` tosses for surfaces that are there by chance; -1 where it is on its own"""
+    x: Words
+    """of the pixel a ray belongs to; with the next two what `tracing` tosses for surfaces that are there by chance"""
+    y: Words
+    sample: Words
+    """of that pixel; -1 where the ray is on its own"""
     shadowed: Flags
     """`valid` as the caller of `tracing.visible` set it, while it looks behind cut-outs and through glass"""
     ends: Scalars
@@ -240,8 +241,9 @@ class Packet(NamedTuple):
             tally=np.zeros(1, np.int64),
             asked=np.zeros(LANES, np.int32),
             chance=np.zeros(LANES, np.int32),
-            pixel=np.zeros(LANES, np.int32),
-            turn=np.full(LANES, -1.0),
+            x=np.zeros(LANES, np.int32),
+            y=np.zeros(LANES, np.int32),
+            sample=np.full(LANES, -1, np.int32),
             shadowed=np.zeros(LANES, np.int32),
             ends=np.zeros(LANES),
             begun=np.zeros(LANES),
@@ -269,7 +271,7 @@ def set_ray(packet: Packet, lane: int, origin: Vec, direction: Vec, t_near: floa
     rays[T_FAR, lane] = t_far
     words[MASK, lane] = mask
     words[GEOM, lane] = _INVALID
-    packet.turn[lane] = -1.0
+    packet.sample[lane] = -1
     packet.valid[lane] = -1
 
 

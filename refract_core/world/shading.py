@@ -15,9 +15,9 @@ import numpy as np
 from ..kernels.compile import inlined
 from ..kernels.lanes import LANES, Flags, Scalars, Vectors, Words, put
 from ..kernels.sampling import MIRRORED, Key, Keys, Purpose, branched, hash32, key_of, set_key, unit_pair
-from ..kernels.vec import Vec, add, along, dot, flip_towards, frame, lerp, mul, normalize, row, scale, sub
+from ..kernels.vec import Vec, add, along, dot, flip_towards, lerp, mul, normalize, row, scale, sub
 from ..optics.interface import f0_from_ior
-from ..optics.lobes import MIRROR_ALPHA, sample_half_vector, specular_albedo
+from ..optics.lobes import MIRROR_ALPHA, sample_cosine, sample_half_vector, specular_albedo
 from ..scene import Param
 from .caustics import caustic_irradiance
 from .embree import SCATTERED, Packet, clear, has_hit, ray_direction, set_ray
@@ -347,10 +347,7 @@ def _shadow_length(lights: LightTable, l: int, key: Key) -> float:  # noqa: E741
 def add_light(block: Block, lane: int, lights: LightTable, l: int) -> None:  # noqa: E741
     """Add one light, whose share of the hit is known, to its sums."""
     seen, hidden = row(block.lamp_seen, lane), row(lights.hidden, l)
-    arrives = (
-        hidden[0] + (1.0 - hidden[0]) * seen[0], hidden[1] + (1.0 - hidden[1]) * seen[1],
-        hidden[2] + (1.0 - hidden[2]) * seen[2],
-    )  # fmt: skip
+    arrives = add(hidden, mul(sub((1.0, 1.0, 1.0), hidden), seen))
     if max(arrives[0], arrives[1], arrives[2]) <= 0.0 or not _links(block, lane, lights, l):
         return
     matt = gleam = over = mul(row(lights.radiance, l), arrives)
@@ -427,7 +424,7 @@ def add_sky_ray(
     n = row(block.ns, i)
     if environment.even:  # the cosine alone is the density, and keeps the strata of the sequence
         u1, u2 = unit_pair(nth(key, k, times), Purpose.SKY_COSINE.value)
-        direction, weight = _cosine_direction(n, u1, u2), (1.0, 1.0, 1.0)
+        direction, weight = sample_cosine(n, u1, u2), (1.0, 1.0, 1.0)
     elif times == 1:
         direction, weight = _sky_direction(environment, n, key)
     else:
@@ -450,7 +447,7 @@ def _nth_sky_direction(environment: EnvironmentTable, n: Vec, key: Key, k: int, 
         direction, radiance, tint = sample_direction(environment, u1, u2)
     else:
         u1, u2 = unit_pair(own, Purpose.SKY_COSINE.value)
-        direction = _cosine_direction(n, u1, u2)
+        direction = sample_cosine(n, u1, u2)
         radiance, tint = direction_pdf(environment, direction)
     cosine = dot(direction, n)
     if cosine <= 0.0:
@@ -487,7 +484,7 @@ def _sky_direction(environment: EnvironmentTable, n: Vec, key: Key) -> tuple[Vec
             return direction, (1.0, 1.0, 1.0) if key.sample == 0 else _beside_all(environment, n, tint)
         branch = int(np.int64(hash32(key.branch, k, 0)))
     u1, u2 = unit_pair(key, Purpose.SKY_COSINE.value)
-    return _cosine_direction(n, u1, u2), (1.0, 1.0, 1.0)
+    return sample_cosine(n, u1, u2), (1.0, 1.0, 1.0)
 
 
 @inlined
@@ -500,15 +497,6 @@ def _beside_all(environment: EnvironmentTable, n: Vec, tint: Vec) -> Vec:
         light * tint[1] / e[1] if e[1] > 0.0 else 0.0,
         light * tint[2] / e[2] if e[2] > 0.0 else 0.0,
     )
-
-
-@inlined
-def _cosine_direction(n: Vec, u1: float, u2: float) -> Vec:
-    x, y = frame(n)
-    r = math.sqrt(u1)
-    phi = 2.0 * math.pi * u2
-    z = math.sqrt(max(0.0, 1.0 - u1))
-    return add(add(scale(x, r * math.cos(phi)), scale(y, r * math.sin(phi))), scale(n, z))
 
 
 @inlined

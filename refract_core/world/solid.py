@@ -61,6 +61,13 @@ def winding(point: F64, points: F64, triangles: NDArray[np.integer]) -> float:
     return float(np.arctan2(above, below).sum() / (2.0 * np.pi))
 
 
+def encloses(points: NDArray[np.floating], triangles: NDArray[np.integer], point: F64) -> bool:
+    """A closed surface goes round a point."""
+    if (point <= points.min(axis=0)).any() or (point >= points.max(axis=0)).any():  # most are far away
+        return False
+    return winding(point, points.astype(np.float64), triangles) > 0.5
+
+
 def crossings(corners: F64, origin: F64, direction: F64) -> tuple[F64, NDArray[np.bool_]]:
     """Where a ray meets triangles (Moeller and Trumbore, Journal of Graphics Tools 2(1), 1997).
 

@@ -10,6 +10,7 @@ import numpy as np
 from ..kernels.compile import inlined
 from ..kernels.lanes import Scalars, Words
 from ..kernels.vec import Vec, add, along, cross, dot, flip_towards, length, normalize, row, scale, sub
+from ..optics.models import on_open_mesh
 from ..scene import Channel, Param
 from .embree import GEOM, HIT_U, HIT_V, INST, PRIM, Packet, hit_distance
 from .tables import Geometry, World
@@ -115,6 +116,13 @@ def corners_of(geometry: Geometry, part: int, primitive: int) -> tuple[Vec, Vec,
     b = row(geometry.points, geometry.triangles[t, 1])
     c = row(geometry.points, geometry.triangles[t, 2])
     return a, b, c
+
+
+@inlined
+def drawn_model(world: World, hit: Hit) -> int:
+    """As `scene.Model`: what the glass at a hit is drawn as."""
+    model = world.materials.drawn[hit.material]
+    return on_open_mesh(model) if world.geometry.sheet[hit.part] != 0 else int(model)
 
 
 @inlined

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..errors import SceneError
 from ..kernels.arrays import F32_1D, F32_2D, F32_3D, I32_1D, I32_2D, I32_3D, I64_1D, I64_2D, U8_1D, U32_2D
+from ..models import BY_TOKEN
 from ..scene import Material, Mesh, Model, Param, Scene, Source, Sphere
 from . import embree
 from .caustics import Caustics, no_caustics
@@ -85,7 +86,9 @@ class MaterialTable(NamedTuple):
     driven: I32_1D
     """shape (M,): bit i is set where a texture or primvar drives input i"""
     model: I32_1D
-    """shape (M,), as `scene.Model`"""
+    """shape (M,), as `scene.Model`: its own; NONE where it is opaque"""
+    drawn: I32_1D
+    """shape (M,): what it is drawn as, which the settings may say for all that is refractive"""
     specular_workflow: U8_1D
     presence: U8_1D
     threshold: F32_1D
@@ -105,8 +108,6 @@ class GlassShade(NamedTuple):
     """shape (G,): 1 where the light that goes through a part, or off it, is in `World.caustics`; it stops all other"""
     walked: bool
     """some glass is looked through straight on; otherwise all of it stops light"""
-    model: int
-    """a `scene.Model` for every refractive material, or -1 for their own"""
 
 
 class World(NamedTuple):
@@ -131,22 +132,22 @@ def world_of(
     textures: TextureTable,
     lights: LightTable,
     environment: EnvironmentTable,
-    model: int,
 ) -> World:
-    """Put the tables together; light goes straight through all glass.
-
-    Args:
-        model: a `scene.Model` for every refractive material, or -1 for their own.
-    """
+    """Put the tables together; light goes straight through all glass."""
     lit = len(lights.kind) > 0 or (environment.present and not environment.dark)
     walked = bool((materials.model != Model.NONE).any())
-    glass = GlassShade(np.zeros(len(geometry.thing), np.uint8), walked, model)
+    glass = GlassShade(np.zeros(len(geometry.thing), np.uint8), walked)
     cutouts = bool(materials.cutout.any())
     return World(geometry, materials, textures, lights, environment, glass, no_caustics(), cutouts, lit)
 
 
-def pack_materials(materials: Sequence[Material], slots: dict[str, int]) -> MaterialTable:
-    """Rows of sources as columns of arrays. `slots` gives primvar names their numbers."""
+def pack_materials(materials: Sequence[Material], slots: dict[str, int], drawn_as: str) -> MaterialTable:
+    """Rows of sources as columns of arrays.
+
+    Args:
+        slots: gives primvar names their numbers.
+        drawn_as: token of the model that all refractive materials are drawn as; '' for their own.
+    """
 
     def column(get: Any, dtype: Any) -> NDArray[Any]:
         if not materials:
@@ -169,6 +170,7 @@ def pack_materials(materials: Sequence[Material], slots: dict[str, int]) -> Mate
         primvar_slot=column(lambda s: slots.get(s.primvar, -1), np.int32),
         driven=per_material(_driven, np.int32),
         model=per_material(lambda m: int(m.model), np.int32),
+        drawn=per_material(lambda m: int(BY_TOKEN[drawn_as] if drawn_as and m.refractive else m.model), np.int32),
         specular_workflow=per_material(lambda m: m.specular_workflow, np.uint8),
         presence=per_material(lambda m: m.opacity_presence, np.uint8),
         threshold=per_material(lambda m: m.opacity_threshold, np.float32),
@@ -261,12 +263,17 @@ def pack_geometry(
         SceneError: a mesh breaks its contract; the message names its path.
     """
     slots = primvar_slots(scene.materials)
-    pile = _Pile(slots)
+    pile, casters = _Pile(slots), caster_sets(scene)
+
+    def mask(material: int, thing: Mesh | Sphere) -> int:
+        return _mask(scene.materials[material], thing.static, thing.path, captured_sets, casters)
+
     for thing, mesh in enumerate(scene.meshes):
         _check_mesh(mesh, len(scene.materials))
-        _add_mesh(pile, scene, mesh, thing, captured_sets)
+        used, which = np.unique(mesh.materials, return_inverse=True)
+        _add_mesh(pile, mesh, thing, np.array([mask(m, mesh) for m in used], np.int64)[which])
     for i, ball in enumerate(scene.spheres):
-        _add_sphere(pile, scene, ball, len(scene.meshes) + i, captured_sets)
+        _add_sphere(pile, ball, len(scene.meshes) + i, mask(ball.material, ball))
     points = np.concatenate(pile.points) if pile.points else np.zeros((0, 3), np.float32)
     bvh = Bvh(points, pile.parts)
     columns: list[Any] = list(zip(*pile.rows, strict=True)) or [(), (), (), (), ()]
@@ -334,11 +341,7 @@ def _mask(
     return mask
 
 
-def _add_mesh(pile: _Pile, scene: Scene, mesh: Mesh, thing: int, captured_sets: Sequence[Any]) -> None:
-    used, which = np.unique(mesh.materials, return_inverse=True)
-    casters = caster_sets(scene)
-    masks = [_mask(scene.materials[m], mesh.static, mesh.path, captured_sets, casters) for m in used]
-    mask_of_triangle = np.array(masks, np.int64)[which]
+def _add_mesh(pile: _Pile, mesh: Mesh, thing: int, mask_of_triangle: NDArray[np.int64]) -> None:
     bounds = (mesh.points.min(axis=0), mesh.points.max(axis=0)) if len(mesh.points) else (np.zeros(3), np.zeros(3))
     base = pile.point_count
     pile.points.append(mesh.points)
@@ -357,8 +360,7 @@ def _add_mesh(pile: _Pile, scene: Scene, mesh: Mesh, thing: int, captured_sets: 
         )
 
 
-def _add_sphere(pile: _Pile, scene: Scene, ball: Sphere, thing: int, captured_sets: Sequence[Any]) -> None:
-    mask = _mask(scene.materials[ball.material], ball.static, ball.path, captured_sets, caster_sets(scene))
+def _add_sphere(pile: _Pile, ball: Sphere, thing: int, mask: int) -> None:
     part = Part(mask, None, (*ball.centre, ball.radius))
     centre = np.array(ball.centre)
     bounds = (centre - ball.radius, centre + ball.radius)

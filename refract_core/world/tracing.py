@@ -9,14 +9,7 @@ from ..kernels.lanes import LANES, Scalars, Vectors, put
 from ..kernels.sampling import chance_of_bits, hash32
 from ..kernels.vec import Vec, dot, mul, row, scale
 from ..optics.interface import fresnel_dielectric, transmittance
-from ..optics.models import (
-    BOX_MIN_COS,
-    absorption_distance_of,
-    cosine_inside,
-    is_sheet,
-    on_open_mesh,
-    thickness_of,
-)
+from ..optics.models import absorption_distance_of, exit_of, is_sheet, thickness_of
 from ..scene import Param
 from .embree import (
     COHERENT,
@@ -43,7 +36,7 @@ from .embree import (
     set_ray,
 )
 from .offsets import off_surface, past, short_of
-from .surface import Ray, color_input, float_input, hit_in, interaction, share_input
+from .surface import Ray, color_input, drawn_model, float_input, hit_in, interaction, share_input
 from .tables import World
 
 _MAX_CUTOUTS = 64
@@ -73,8 +66,9 @@ def _absent(world: World, packet: Packet, lane: int) -> bool:
         return opacity < threshold
     # Coverage as chance. The samples of a pixel take turns, so that together they see as much as is there; a ray that
     # belongs to none goes by its own bits, so that it is the same wherever it is traced.
-    if packet.turn[lane] >= 0.0:
-        return opacity <= (chance_of_bits(packet.pixel[lane], hit.part, 0) + packet.turn[lane]) % 1.0
+    if packet.sample[lane] >= 0:
+        pixel, turn = int(np.int32(hash32(packet.x[lane], packet.y[lane], 0))), packet.sample[lane] * _GOLDEN % 1.0
+        return opacity <= (chance_of_bits(pixel, hit.part, 0) + turn) % 1.0
     words = packet.words
     return opacity <= chance_of_bits(
         words[DIR_X, lane] ^ words[ORG_X, lane], words[DIR_Y, lane], words[DIR_Z, lane] ^ hit.part
@@ -84,8 +78,7 @@ def _absent(world: World, packet: Packet, lane: int) -> bool:
 @inlined
 def belongs_to(packet: Packet, lane: int, x: int, y: int, sample: int) -> None:
     """Say whose the ray in a lane is: one of a pixel's samples, which take turns a golden section apart."""
-    packet.pixel[lane] = np.int32(hash32(x, y, 0))
-    packet.turn[lane] = sample * _GOLDEN % 1.0
+    packet.x[lane], packet.y[lane], packet.sample[lane] = x, y, sample
 
 
 @inlined
@@ -155,14 +148,12 @@ def lamp_visible(packet: Packet, world: World, mask: int, which: int, seen: Vect
 def _visible(packet: Packet, world: World, solid: int, cutout: int, seen: Vectors) -> None:
     """`visible`, with a mask of its own for cut-outs."""
     handle = world.geometry.handle
+    stops = solid if world.glass.walked else solid | REFRACTIVE
     for lane in range(LANES):
         packet.ends[lane] = packet.rays[T_FAR, lane]
         packet.shadowed[lane] = packet.valid[lane]
         put(seen, lane, (1.0, 1.0, 1.0))
-        packet.words[MASK, lane] = solid
-    if not world.glass.walked:
-        for lane in range(LANES):
-            packet.words[MASK, lane] |= REFRACTIVE
+        packet.words[MASK, lane] = stops
     occluded(packet, handle, COHERENT)
     _leave_out_blocked(packet, seen)
     if world.cutouts:
@@ -219,20 +210,17 @@ def _look_through_glass(packet: Packet, world: World, seen: Vectors) -> None:
 @inlined
 def _pass_wall(packet: Packet, lane: int, world: World, seen: Vectors) -> bool:
     """Take from `seen` what the wall of glass that was hit takes. Whether any light is left."""
-    hit, ray, glass = hit_in(packet, lane, world.geometry), ray_of(packet, lane), world.glass
-    if glass.casts[hit.part] != 0:
+    hit, ray = hit_in(packet, lane, world.geometry), ray_of(packet, lane)
+    if world.glass.casts[hit.part] != 0:
         put(seen, lane, (0.0, 0.0, 0.0))
         return False
-    at = interaction(world.geometry, hit, ray, 0.0)
-    model = world.materials.model[hit.material] if glass.model < 0 else glass.model
-    if world.geometry.sheet[hit.part] != 0:
-        model = on_open_mesh(model)
+    at, model = interaction(world.geometry, hit, ray, 0.0), drawn_model(world, hit)
     ior, cosine = max(1.0, float_input(world, at, Param.IOR.value)), abs(dot(at.ng, ray.direction))
     share = 1.0 - fresnel_dielectric(cosine, 1.0 / ior)
     length = 0.0
     enters = dot(at.ng, ray.direction) < 0.0
     if is_sheet(model):
-        length = thickness_of(model, 0.0) / max(cosine_inside(cosine, ior), BOX_MIN_COS)
+        length = exit_of(model, at.point, at.ng, scale(ray.direction, -1.0), ior, thickness_of(model, 0.0))[0]
     elif enters:
         packet.begun[lane] = hit.t
     else:

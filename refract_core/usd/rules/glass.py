@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ...models import SHEET, Behind, Model, model_for
 from ...scene import F64, Material, Mesh, Param, Scene, Source, Sphere
-from ...world.solid import is_convex, winding
+from ...world.solid import encloses, is_convex
 from ..geometry.shapes import INWARDS, TURN
 from .findings import ERROR, WARNING, Finding, Rule
 
@@ -230,6 +230,4 @@ def _holds(outer: Glass, inner: Glass) -> bool:
         return False
     if outer.radius > 0.0:
         return bool(np.linalg.norm(outer.points[0] - point) < outer.radius)
-    if (point < outer.points.min(axis=0)).any() or (point > outer.points.max(axis=0)).any():
-        return False
-    return winding(point, outer.points, outer.triangles) > 0.5
+    return encloses(outer.points, outer.triangles, point)

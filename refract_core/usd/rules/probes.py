@@ -11,7 +11,7 @@ from pxr import Usd
 from ...probes.digest import stale_bakes
 from ...scene import F64, Probe, Scene, Volume
 from ...version import __version__
-from ...world.solid import winding
+from ...world.solid import encloses
 from .findings import ERROR, INFO, WARNING, Finding, Rule
 from .glass import Glass
 
@@ -99,11 +99,8 @@ def _standing(probe: Probe, scene: Scene, glass: list[Glass]) -> Iterator[Findin
 def _solids_at(scene: Scene, point: F64) -> Iterator[tuple[str, Callable[[F64], bool]]]:
     """Closed objects round a point, each with a test of whether it holds another."""
     for mesh in scene.meshes:
-        if not mesh.closed or (point < mesh.points.min(axis=0)).any() or (point > mesh.points.max(axis=0)).any():
-            continue
-        points, triangles = mesh.points.astype(np.float64), mesh.triangles.astype(np.int64)
-        if winding(point, points, triangles) > 0.5:
-            yield mesh.path, lambda at, p=points, t=triangles: winding(at, p, t) > 0.5  # type: ignore[misc]
+        if mesh.closed and encloses(mesh.points, mesh.triangles, point):
+            yield mesh.path, lambda at, m=mesh: encloses(m.points, m.triangles, at)  # type: ignore[misc]
     for ball in scene.spheres:
         if np.linalg.norm(point - ball.centre) < ball.radius:
             yield ball.path, lambda at, b=ball: bool(np.linalg.norm(at - b.centre) < b.radius)  # type: ignore[misc]
