@@ -278,7 +278,8 @@ MUTANTS = (
            "if packet.valid[lane] != 0:  # from where it began", "if False:  # from where it began", CAUSTICS),
     Mutant("all photons toss the same coin", "transport/photons.py",
            "scratch.cell.sample[slot] = first + lane, 0, 0", "scratch.cell.sample[slot] = 0, 0, 0", CAUSTICS),
-    Mutant("every sample tosses the same coin", "world/tracing.py", "packet.sample[lane] * _GOLDEN % 1.0", "0.0", CAUSTICS),
+    Mutant("every sample tosses the same coin", "world/tracing.py",
+           "packet.sample[lane] * _GOLDEN % 1.0", "0.0", CAUSTICS),
 )  # fmt: skip
 
 

@@ -241,6 +241,8 @@ def test_complexity_is_accepted_and_says_what_it_does_not_do(engine: Engine, tmp
         (["a.##.##x#.png", "-f", "1:2"], "exactly one"),
         (["a.###.png", "-f", "1:2x0.5"], "decimals"),
         (["a.###.png", "-f", "one"], "'one' is not a frame range"),
+        (["a.png", "--caustics", "some"], "--caustics is 'some'; it must be on, off, or a number of photons"),
+        (["a.png", "--caustics", "-5"], "--caustics is -5; it must be between 0 and 16777216"),
     ],
 )
 def test_wrong_words_are_exit_code_2_before_the_stage_opens(
