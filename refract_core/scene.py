@@ -117,9 +117,22 @@ class Material:
         return self.model is not Model.NONE
 
     @property
+    def emits(self) -> bool:
+        """Its emissive colour is not black, or a picture or primvar drives it."""
+        source = self.inputs[Param.EMISSIVE]
+        if source.texture >= 0 or source.primvar:
+            return max(source.scale[:3]) > 0.0 or max(source.bias[:3]) > 0.0
+        return max(source.value[:3]) > 0.0
+
+    @property
     def cutout(self) -> bool:
         """Some of the surface may be absent, so a hit must be looked at before it counts."""
         return self.opacity_threshold > 0.0 or self.opacity_presence
+
+
+def prim_of(path: str) -> str:
+    """The prim that a path belongs to: instances of a PointInstancer are drawn as `/Instancer/[7]/...`."""
+    return path.partition("/[")[0]
 
 
 @dataclass(frozen=True)
@@ -173,6 +186,10 @@ class LightKind(IntEnum):
     """Stands in where a stage has no light: at the eye, without falloff. Nothing it lights is in a shadow."""
     CYLINDER = 5, "CylinderLight"
     """Its axis is the light's X. It shines outward, but not from its ends."""
+    GLOW = 6, ""
+    """Triangles of the stage that emit light; `world.emitters` makes these and the next, no reader does."""
+    BALL = 7, ""
+    """An exact sphere of the stage that emits light."""
 
     usd_type: str
     """Its prim type in UsdLux; '' for none."""

@@ -21,8 +21,9 @@ QUALITIES: dict[str, dict[str, Any]] = {
 """What each level of quality stands for; each setting may also be chosen by its own name. The last one draws all
 samples of every pixel, and leaves out what the picture lends its glass, and what probes do."""
 PRESETS: dict[str, dict[str, Any]] = {
-    "hdrp": {"screen": "proxy", "tiers": ("screen", "probe", "sky"), "max_layers": 1, "caustics": 0},
-    "arm": {"model": "single", "tiers": ("probe", "sky"), "max_layers": 1, "caustics": 0},
+    "hdrp": {"screen": "proxy", "tiers": ("screen", "probe", "sky"), "max_layers": 1, "caustics": 0,
+             "emission_light": False},
+    "arm": {"model": "single", "tiers": ("probe", "sky"), "max_layers": 1, "caustics": 0, "emission_light": False},
 }
 """Settings that make other renderers' pictures."""
 PURPOSES = ("default", "render", "proxy", "guide")
@@ -80,6 +81,8 @@ class RenderSettings:
     purposes: tuple[str, ...] = ("default", "render")
     camera_light: bool = True
     """Light from the camera where a stage has no light, no dome and nothing that glows."""
+    emission_light: bool = True
+    """What glows lights other things. Otherwise it is seen, and no more."""
     jobs: int = 0
     """Threads; 0 means all cores."""
     tile_size: int = 64

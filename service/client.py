@@ -61,6 +61,7 @@ class RenderSettings(TypedDict, total=False):
     max_layers: int
     exposure: float
     camera_light: bool
+    emission_light: bool
     purposes: list[str]
     time_code: float
     widths: list[int]

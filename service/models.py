@@ -78,6 +78,7 @@ class Render(StageOnly):
     max_layers: Annotated[int, Field(ge=1, le=32, description="surfaces of glass that a ray may enter")] | None = None
     exposure: Annotated[float, Field(ge=-64.0, le=64.0)] | None = None
     camera_light: bool | None = None
+    emission_light: bool | None = None
     purposes: Annotated[list[Purpose], Field(min_length=1, max_length=4), _Once] | None = None
     time_code: TimeCode | None = None
     widths: Annotated[list[Side], Field(min_length=1, max_length=64), _Once] | None = Field(

@@ -40,7 +40,7 @@ _CUT_OFF = "the package has no directory at its end, so it was cut off"
 _UNITS = ("Z", "thickness", "path_length", "layers")
 """Planes that are not between 0 and 1: their PNG is scaled, and says by how much."""
 _SETTINGS = ("camera", "image_width", "image_height", "quality", "preset", "samples", "tolerance", "light_samples",
-             "caustics", "cut", "tiers", "screen", "model", "max_layers", "exposure", "camera_light",
+             "caustics", "cut", "tiers", "screen", "model", "max_layers", "exposure", "camera_light", "emission_light",
              "purposes")  # fmt: skip
 
 

@@ -94,6 +94,13 @@ def shell(path: str, outer: float, inner: float, index: int, steps: int = 12) ->
     return Mesh(path, both.astype(np.float32), faces.astype(np.uint32), materials, closed=True)
 
 
+def globe(path: str, radius: float, index: int, steps: int = 12, centre: ArrayLike = (0, 0, 0)) -> Mesh:
+    """A faceted ball whose corners lie on the sphere."""
+    points, triangles = _globe(steps)
+    placed = (points * radius + np.asarray(centre)).astype(np.float32)
+    return Mesh(path, placed, triangles.astype(np.uint32), np.full(len(triangles), index, np.int32), closed=True)
+
+
 def _globe(steps: int) -> tuple[F64, NDArray[np.int64]]:
     """Points and outward triangles of a unit ball."""
     rings = [
@@ -203,8 +210,9 @@ def scene(
 
 
 def draw(what: rc.Scene, width: int = 64, height: int = 64, **settings: Any) -> dict[str, F32]:
-    """Planes of a one-sample picture without caustics, on one thread, unless told otherwise."""
-    chosen = {"samples": 1, "jobs": 1, "tiers": ("ray", "sky"), "caustics": 0, **settings}
+    """Planes of a one-sample picture on one thread, without caustics, where what glows lights nothing, unless told
+    otherwise."""
+    chosen = {"samples": 1, "jobs": 1, "tiers": ("ray", "sky"), "caustics": 0, "emission_light": False, **settings}
     return rc.render(what, rc.RenderSettings(image_width=width, image_height=height, **chosen)).planes
 
 

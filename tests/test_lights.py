@@ -16,7 +16,8 @@ from refract_core.kernels.compile import kernel
 from refract_core.kernels.pointer import Pointer
 from refract_core.scene import Light, LightKind, Mesh, Model, Scene, Shadow, Shaping
 from refract_core.world.lamps import _picture_levels, pack_lights
-from refract_core.world.lights import _angle_over_sine, irradiance_factor
+from refract_core.world.lights import irradiance_factor
+from refract_core.world.polygon import _angle_over_sine
 from refract_core.world.shaping import shape_matt
 
 F64 = NDArray[np.float64]

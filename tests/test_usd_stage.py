@@ -355,21 +355,6 @@ GLOWING = """
 """
 
 
-@pytest.mark.parametrize(
-    ("stage", "told"),
-    [
-        (GLOWING + BALL, True),
-        (GLOWING, False),
-        (GLOWING + BALL + 'def SphereLight "L" {}', False),
-        (GLOWING + BALL + 'def DomeLight "L" {}', False),
-        (BALL, False),
-    ],
-)
-def test_a_stage_that_is_lit_by_what_glows_alone_is_told_that_the_rest_is_black(stage: str, told: bool) -> None:
-    """What glows keeps the camera's light away and lights nothing: without a word, a black picture is a riddle."""
-    assert ("does not light other things" in texts(read(stage), "/")) is told
-
-
 @pytest.mark.parametrize(("glow", "lit"), [("(0, 0, 0)", True), ("(0, 0.5, 0)", False)])
 def test_the_camera_light_does_not_shine_on_what_glows(glow: str, lit: bool) -> None:
     """A lamp at the eye burns a sun into every sphere of a room that is lit by its own walls."""

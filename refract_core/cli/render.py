@@ -163,6 +163,13 @@ DisableCameraLight = Annotated[
         help="Add no light where the stage has none. Without it one shines from the camera if nothing else shines.",
     ),
 ]
+DisableEmissionLight = Annotated[
+    bool,
+    typer.Option(
+        "--disable-emission-light",
+        help="Let what glows be seen, but light nothing else, as real-time engines have it.",
+    ),
+]
 SettingsPrim = Annotated[
     str,
     typer.Option(
@@ -208,6 +215,7 @@ def render(
     color_correction_mode: ColorCorrection = "sRGB",
     exposure: Exposure = None,
     disable_camera_light: DisableCameraLight = False,
+    disable_emission_light: DisableEmissionLight = False,
     render_settings_prim_path: SettingsPrim = "",
     jobs: Jobs = None,
     executor: Executor = "",
@@ -235,6 +243,7 @@ def render(
             "purposes": None if purposes is None else _purposes(purposes),
             "exposure": exposure,
             "camera_light": False if disable_camera_light else None,
+            "emission_light": False if disable_emission_light else None,
             "jobs": jobs,
             "tile_size": tile_size,
         }

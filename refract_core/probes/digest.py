@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene import Environment, Light, Material, Mesh, Notice, Param, Probe, Scene, Source, Sphere, Texture
+from ..scene import Environment, Light, Material, Mesh, Notice, Param, Probe, Scene, Source, Sphere, Texture, prim_of
 from ..version import __version__
 
 _UNSEEN = (Param.THICKNESS, Param.TRANSMITTANCE)  # of what is behind a surface; an opaque one does not ask
@@ -42,18 +42,32 @@ def probe_digest(scene: Scene, probe: Probe) -> str:
     wanted = None if probe.captured is None else set(probe.captured)
     seen: list[bytes] = []
     things: tuple[Mesh | Sphere, ...] = (*scene.meshes, *scene.spheres)
+    emits = [material.emits for material in scene.materials]
     for thing in things:
-        if (thing.static or probe.mode == "realtime") and (wanted is None or _prim_of(thing.path) in wanted):
-            seen.append(_mesh(scene, thing) if isinstance(thing, Mesh) else _sphere(scene, thing))
+        if (thing.static or probe.mode == "realtime") and (wanted is None or prim_of(thing.path) in wanted):
+            seen.append(_of_thing(scene, thing))
     total = hashlib.sha256()
     _feed(total, "capture", probe.capture_point, probe.clipping, probe.resolution)
     _feed(total, "background", () if probe.background is None else probe.background)
     _feed(total, "camera light", int(scene.camera_light))
     _feed_all(total, "seen", (one for one in seen if one))
+    # What glows lights what the probe sees, though it may not see it.
+    shining = [_of_thing(scene, thing) for thing in things if any(emits[m] for m in _used(thing))]
+    if any(shining):
+        _feed_all(total, "glow", (one for one in shining if one))
     _feed_all(total, "lights", (_remembered(light, _light) for light in scene.lights))
     if scene.environment is not None:
         total.update(_remembered(scene.environment, _environment))
     return total.hexdigest()
+
+
+def _used(thing: Mesh | Sphere) -> list[int]:
+    """Rows of its materials."""
+    return [int(m) for m in np.unique(thing.materials)] if isinstance(thing, Mesh) else [thing.material]
+
+
+def _of_thing(scene: Scene, thing: Mesh | Sphere) -> bytes:
+    return _mesh(scene, thing) if isinstance(thing, Mesh) else _sphere(scene, thing)
 
 
 def stale_bake(scene: Scene, probe: Probe) -> Notice | None:
@@ -91,11 +105,6 @@ def stale_bakes(probes: Iterable[Probe], scene_at: Callable[[float], Scene]) -> 
         then = next((other for other in scenes[when].probes if other.path == probe.path), probe)
         notices.append(stale_bake(scenes[when], replace(then, bake=probe.bake)))
     return [notice for notice in notices if notice is not None]
-
-
-def _prim_of(path: str) -> str:
-    """The prim that a path belongs to: instances of a PointInstancer are drawn as `/Instancer/[7]/...`."""
-    return path.partition("/[")[0]
 
 
 # --- things

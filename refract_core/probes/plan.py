@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene import Camera, Material, Notice, Param, Probe, Scene, Volume
+from ..scene import Camera, Material, Notice, Param, Probe, Scene, Volume, prim_of
 from ..world.embree import CASTER_SHIFTS, FIRST_CAPTURED_BIT, OPAQUE, OPAQUE_STATIC
-from ..world.tables import caster_sets, prim_of
+from ..world.tables import caster_sets
 from .lookup import bounds_of, camera_weight
 
 Box = tuple[NDArray[np.float64], NDArray[np.float64]]

@@ -28,8 +28,8 @@ from ..world.caustics import (
     no_caustics,
     raise_levels,
 )
-from ..world.solid import encloses
-from ..world.tables import GlassShade, World
+from ..world.solid import along_a_curve, encloses
+from ..world.tables import GlassShade, World, rows_of
 from .work import Work
 
 _CUT = 0.01
@@ -64,7 +64,7 @@ def _throws_caustics(world: World) -> NDArray[np.bool_]:
     geometry, materials = world.geometry, world.materials
     casts = np.zeros(len(geometry.thing), np.bool_)
     for g in range(len(casts)):
-        used = np.unique(geometry.material[_rows(world, g)])
+        used = np.unique(geometry.material[rows_of(world.geometry, g)])
         own = materials.model[used]
         refractive = own.size > 0 and bool((own != 0).all()) and not materials.cutout[used].any()
         bends = bool(np.isin(materials.drawn[used], _BENDING).all())
@@ -73,16 +73,9 @@ def _throws_caustics(world: World) -> NDArray[np.bool_]:
     return casts
 
 
-def _rows(world: World, part: int) -> slice:
-    """A part's primitives, as rows of `Geometry.triangles`."""
-    first = world.geometry.first
-    last = first[part + 1] if part + 1 < len(first) else len(world.geometry.triangles)
-    return slice(int(first[part]), int(last))
-
-
 def _corners(world: World, part: int) -> F64:
     """Shape (T, 3, 3) [m]."""
-    corners: F64 = world.geometry.points[world.geometry.triangles[_rows(world, part)]].astype(np.float64)
+    corners: F64 = world.geometry.points[world.geometry.triangles[rows_of(world.geometry, part)]].astype(np.float64)
     return corners
 
 
@@ -142,22 +135,11 @@ def _pieces(world: World, casts: NDArray[np.bool_]) -> tuple[NDArray[np.int64], 
             order, area = np.arange(count), np.full(count, 4.0 * math.pi * radius * radius / count)
         else:
             corners = _corners(world, int(g))
-            order = _along_a_curve(corners.mean(axis=1))
+            order = along_a_curve(corners.mean(axis=1))
             area = 0.5 * np.linalg.norm(_across(corners), axis=1)[order]
         found.append((np.full(len(order), g), order, area))
     parts, primitives, areas = (np.concatenate(column) for column in zip(*found, strict=True))
     return parts, primitives, areas
-
-
-def _along_a_curve(points: F64) -> NDArray[np.int64]:
-    """Order of points along Morton's curve: those next to each other are so in space, so that strata are, too."""
-    low, size = points.min(axis=0), max(float(np.ptp(points, axis=0).max()), 1e-30)
-    cells = ((points - low) / size * 1023.0).astype(np.int64)
-    code = np.zeros(len(points), np.int64)
-    for bit in range(10):
-        for axis in range(3):
-            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return np.argsort(code, kind="stable")
 
 
 def _bodies_around(world: World, scene: Scene, light: int, parts: NDArray[np.int64]) -> list[int]:
@@ -254,7 +236,7 @@ def with_caustics(world: World, thrown: Thrown | None) -> World:
 
 def _glass_parts(world: World) -> NDArray[np.bool_]:
     refractive = world.materials.model[world.geometry.material] != 0
-    return np.array([refractive[_rows(world, g)].any() for g in range(len(world.geometry.thing))], np.bool_)
+    return np.array([refractive[rows_of(world.geometry, g)].any() for g in range(len(world.geometry.thing))], np.bool_)
 
 
 def _table(world: World, scene: Scene, wanted: Wanted, work: Work) -> Caustics:

@@ -21,13 +21,13 @@ from ..probes.capture import Over, face_camera, paste_face
 from ..probes.lookup import empty_table
 from ..probes.plan import seen_things
 from ..progress import COMPILING
-from ..scene import F32, Camera, Notice, Probe, Scene
+from ..scene import F32, Camera, Notice, Probe, Scene, prim_of
 from ..settings import RenderSettings
 from ..version import __version__
 from ..view.camera import image_size, view_of
 from ..view.planes import by_name, finish_of, finish_tile, new_planes
 from ..world.embree import Bvh
-from ..world.tables import World, prim_of
+from ..world.tables import World
 from .branching import Tree, needs_compiling
 from .ready import PROBE_SAMPLES, Ready, choose_camera, prepare, prepare_bare
 from .session import Session

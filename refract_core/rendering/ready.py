@@ -19,6 +19,7 @@ from ..scene import Camera, Cubemap, Notice, Param, Probe, Scene
 from ..settings import RenderSettings
 from ..world import environment, textures
 from ..world.embree import Bvh
+from ..world.emitters import what_glows
 from ..world.lamps import pack_lights
 from ..world.tables import World, caster_sets, pack_geometry, pack_materials, primvar_slots, world_of
 from .caustics import caustics_of, plan_caustics, with_caustics
@@ -96,13 +97,14 @@ def _prepare(
     over: Callable[[World, Bvh], Over] | None = None,
 ) -> Ready:
     geometry, bvh, slots = pack_geometry(scene, chosen.captured_sets)
-    plain = world_of(
+    dark = world_of(
         geometry,
         pack_materials(scene.materials, slots, settings.model),
         textures.pack(scene.textures),
         pack_lights(scene, camera.world_from_camera[:3, 3]),
         environment.pack(scene.environment),
     )
+    plain = _with_glow(dark, scene, camera, settings)
     thrown = caustics_of(plain, scene, plan_caustics(plain, camera, settings), work)
     world = by_address(with_caustics(plain, thrown))
     entries = chosen.entries
@@ -110,6 +112,13 @@ def _prepare(
     work.progress(span[0], "probes")
     rays = fill_table(table, entries, world, _runner(work, span), samples, over and over(world, bvh))
     return Ready(world, bvh, table, chosen.thing_probe, rays, chosen.notices)
+
+
+def _with_glow(world: World, scene: Scene, camera: Camera, settings: RenderSettings) -> World:
+    """With what the stage's own surfaces emit among the lights."""
+    eye = camera.world_from_camera[:3, 3]
+    glow = what_glows(world, scene, eye) if settings.emission_light else None
+    return world if glow is None else world._replace(lights=pack_lights(scene, eye, glow), lit=True)
 
 
 def _runner(work: Work, span: tuple[float, float]) -> Run:
@@ -149,7 +158,8 @@ def _from_parts(
     geometry, bvh, slots = hierarchy.made
     materials = pack_materials(scene.materials, slots, settings.model)
     lights = pack_lights(scene, camera.world_from_camera[:3, 3])
-    plain = world_of(geometry, materials, images.made, lights, sky.made)
+    plain = _with_glow(world_of(geometry, materials, images.made, lights, sky.made), scene, camera, settings)
+    lights = plain.lights
     wanted_light = plan_caustics(plain, camera, settings)
     fallen = hierarchy.number, images.number, sky.number, tuple(lights), scene.materials, settings.model, wanted_light
     thrown = session.part("caustics", fallen, lambda: caustics_of(plain, scene, wanted_light, work))

@@ -23,11 +23,11 @@ from ..kernels.lanes import LANES, Vectors, put
 from ..kernels.sampling import Key, Purpose, unit_pair
 from ..kernels.vec import Vec, add, cross, dot, flip_towards, mul, normalize, row, scale, sub
 from ..optics.lobes import MIRROR_ALPHA, sample_cosine, sample_half_vector
-from ..scene import LightKind, Model
+from ..scene import Model
 from ..world.caustics import Landings
 from ..world.embree import OPAQUE, clear
 from ..world.environment import TEXEL_LUMINANCE, direction_pdf, irradiance, radiance, sample_direction
-from ..world.lights import irradiance_factor, shadow_ray
+from ..world.lights import drawn_ray, irradiance_factor, is_flat
 from ..world.offsets import off_surface
 from ..world.shaping import shape_drawn, shape_matt
 from ..world.surface import NOTHING, Interaction, Ray, corners_of, interaction, kept_hit
@@ -115,19 +115,15 @@ def _unoccluded(world: World, light: int, p: Vec, n: Vec) -> Vec:
 
 
 @inlined
-def _from_point(world: World, light: int, p: Vec, n: Vec, direction: Vec, distance: float) -> Vec:
-    """The same as one of its points tells it, drawn evenly over a flat light, which is far from even where it is near;
-    other lights are taken to bring as much from all of theirs."""
+def _from_point(world: World, light: int, p: Vec, n: Vec, direction: Vec, distance: float, share: float) -> Vec:
+    """What one point of a light brings, that `drawn_ray` has drawn [radiance * sr]."""
     lights = world.lights
-    flat = lights.kind[light] == LightKind.RECT.value or lights.kind[light] == LightKind.DISK.value
-    a, b = lights.size[light, 0], lights.size[light, 1]
-    if not flat or a <= 0.0:
-        return _unoccluded(world, light, p, n)
-    area = 4.0 * a * b if lights.kind[light] == LightKind.RECT.value else math.pi * a * a
-    facing = max(0.0, -dot(direction, row(lights.axes[light], 2)))
-    share = area * facing * max(0.0, dot(direction, n)) / (distance * distance) * lights.diffuse[light]
-    brought = scale(row(lights.radiance, light), share)
-    return brought if lights.even[light] != 0 else mul(brought, shape_drawn(lights, light, p, direction, distance))
+    brought = scale(row(lights.radiance, light), share * lights.diffuse[light])
+    if lights.even[light] != 0 or share <= 0.0:
+        return brought
+    if is_flat(lights, light):
+        return mul(brought, shape_drawn(lights, light, p, direction, distance))
+    return mul(brought, shape_matt(lights, light, p, n))
 
 
 @inlined
@@ -230,8 +226,8 @@ def _start(
             direction, brought = _direction_of_sky(world, n, k, u3, u4)
             distance = math.inf
         else:
-            direction, distance = shadow_ray(lights, light, p, u3, u4)
-            brought = _from_point(world, light, p, n, direction, distance)
+            direction, distance, share = drawn_ray(lights, light, p, n, u3, u4)
+            brought = _from_point(world, light, p, n, direction, distance, share)
         put(own.point, lane, p)
         put(own.normal, lane, n)
         put(own.to_light, lane, direction)

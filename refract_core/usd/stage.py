@@ -15,7 +15,7 @@ import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdLux
 
 from ..errors import StageError, UsageError
-from ..scene import F64, Material, Mesh, Notice, Param, Scene, Sphere
+from ..scene import F64, Mesh, Notice, Scene, Sphere, prim_of
 from .camera import choose_camera, read_cameras
 from .diagnostics import captured, words_of
 from .geometry.parts import Bound, Part, Tables, assemble, bind
@@ -206,14 +206,12 @@ def _read(
     }
     cameras = choose_camera(stage, time, read_cameras(stage, time, **frame), camera, bounds, notices)
     things = [mesh.path for mesh in meshes] + [ball.path for ball in spheres]
-    paths = tuple(dict.fromkeys(path.partition("/[")[0] for path in things))
+    paths = tuple(dict.fromkeys(prim_of(path) for path in things))
     lights, environment = read_lights(stage, time, purposes=purposes, drawn=paths, **frame)
     every = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
-    glow, dull = _glow(tables, meshes, spheres)
-    if glow and dull and not lights and environment is None:
-        text = "what glows does not light other things, and nothing else lights them, so they are black; add a light"
-        notices.append(Notice("/", f"{text} ({some_of(dull)})"))
-    lit = bool(glow) or any(prim.HasAPI(UsdLux.LightAPI) for prim in every)
+    glow = {m for m, material in enumerate(tables.materials) if material.emits}
+    used = {m for mesh in meshes for m in np.unique(mesh.materials).tolist()} | {ball.material for ball in spheres}
+    lit = bool(glow & used) or any(prim.HasAPI(UsdLux.LightAPI) for prim in every)
     return Scene(
         meshes=meshes,
         materials=tuple(tables.materials),
@@ -230,23 +228,6 @@ def _read(
         time_code=float(time.GetValue()),
         name=stage.GetRootLayer().realPath or stage.GetRootLayer().identifier,
     )
-
-
-def _glow(tables: Tables, meshes: tuple[Mesh, ...], spheres: tuple[Sphere, ...]) -> tuple[list[str], list[str]]:
-    """Paths of what is drawn and emits light, for its emissive colour is not black, or a picture or primvar drives it;
-    and of what shows nothing but the light that falls on it."""
-
-    def emits(material: Material) -> bool:
-        source = material.inputs[Param.EMISSIVE]
-        driven = source.texture >= 0 or source.primvar
-        return max(source.scale[:3]) > 0.0 or max(source.bias[:3]) > 0.0 if driven else max(source.value[:3]) > 0.0
-
-    glow = [emits(material) for material in tables.materials]
-    dull = [not (glows or material.refractive) for glows, material in zip(glow, tables.materials, strict=True)]
-    drawn = [(mesh.path, np.unique(mesh.materials).tolist()) for mesh in meshes]
-    drawn += [(ball.path, [ball.material]) for ball in spheres]
-    glowing = [path for path, used in drawn if any(glow[m] for m in used)]
-    return glowing, [path for path, used in drawn if any(dull[m] for m in used)]
 
 
 def _drawn(placed: list[Placed], centre: F64) -> tuple[tuple[Mesh, ...], tuple[Sphere, ...]]:

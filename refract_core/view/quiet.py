@@ -21,7 +21,7 @@ from ..kernels.arrays import F64_1D, F64_2D, I32_1D, I32_2D
 from ..kernels.compile import inlined, kernel, word
 from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Vectors, new_lanes, put
 from ..kernels.sampling import Key, set_key
-from ..kernels.vec import Vec, add, dot, length, lerp, mul, row, scale, sub
+from ..kernels.vec import Vec, add, along, dot, length, lerp, mul, row, sub
 from ..world.embree import COHERENT, EVERYTHING, OPAQUE, clear, has_hit
 from ..world.shading import (
     LOBES,
@@ -37,6 +37,7 @@ from ..world.shading import (
     load_hits,
     nth,
     send_back,
+    share_of_lamp,
     share_of_sky,
 )
 from ..world.surface import hit_in
@@ -88,7 +89,7 @@ class QuietScratch(NamedTuple):
     free: Vectors
     """what comes by each ray of a packet, 0 .. 1"""
     weight: Vectors
-    """of the rays to the sky"""
+    """of the rays to the sky; in its first column, of those to a light"""
 
     @staticmethod
     def fresh() -> QuietScratch:
@@ -257,8 +258,10 @@ def _find(scratch: QuietScratch, world: World, l: int, x0: int, y0: int, x1: int
                 if aim_light(places, i, lights, l):
                     put(scratch.found, i, (1.0, 1.0, 1.0))
                     if shadows:
-                        some = True
-                        add_light_ray(places, i, lights, l, packet, lane, _net_key(x, y))
+                        if add_light_ray(places, i, lights, l, packet, lane, _net_key(x, y)) > 0.0:
+                            some = True
+                        else:  # it has found no point that counts
+                            packet.valid[lane] = 0
             if not some:
                 continue
             lamp_visible(packet, world, OPAQUE, l, scratch.free)
@@ -284,15 +287,17 @@ def _in_doubt(scratch: QuietScratch, i: int) -> bool:
 @inlined
 def _share_of_lamp(scratch: QuietScratch, world: World, rays: int, l: int, i: int, x: int, y: int) -> Vec:  # noqa: E741
     """The share of a light that a place gets, by many rays."""
-    packet, total = scratch.looking.packet, (0.0, 0.0, 0.0)
+    packet, total, weights = scratch.looking.packet, (0.0, 0.0, 0.0), 0.0
     for first in range(0, rays, LANES):
         clear(packet)
         for lane in range(min(LANES, rays - first)):
-            add_light_ray(scratch.places, i, world.lights, l, packet, lane, nth(_net_key(x, y), first + lane, rays))
+            key = nth(_net_key(x, y), first + lane, rays)
+            scratch.weight[lane, 0] = add_light_ray(scratch.places, i, world.lights, l, packet, lane, key)
         lamp_visible(packet, world, OPAQUE, l, scratch.free)
         for lane in range(min(LANES, rays - first)):
-            total = add(total, row(scratch.free, lane))
-    return scale(total, 1.0 / rays)
+            weights += scratch.weight[lane, 0]
+            total = along(total, row(scratch.free, lane), scratch.weight[lane, 0])
+    return share_of_lamp(total, weights)
 
 
 # --- the sky ------------------------------------------------------------------------------------------------------

@@ -7,21 +7,27 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene import F32, Light, LightKind, Scene, Shaping
+from ..scene import F32, Light, LightKind, Scene, Shaping, prim_of
 from .embree import CASTER_SHIFTS
+from .glow import Glow, no_glow
 from .lights import KINDS, LightTable, ShapeTable
-from .tables import caster_sets, prim_of
+from .tables import caster_sets
 
 _MOST_PICTURE = 512
 """Texels along a side of the picture on a light."""
 
 
-def pack_lights(scene: Scene, eye: NDArray[np.float64]) -> LightTable:
+def pack_lights(scene: Scene, eye: NDArray[np.float64], glow: Glow | None = None) -> LightTable:
     """Lights of a scene that shine; with none at all, one at the eye that lights a white surface facing it to 1.
 
     A light of radiance 0 is left out: it would cost its shadow rays and bring nothing.
+
+    Args:
+        glow: what the stage's own surfaces emit, if that lights anything.
     """
     lights = [light for light in scene.lights if any(light.radiance)]
+    roots = [-1] * len(lights) + list(glow.roots if glow else ())
+    lights += glow.lights if glow else ()
     lights += [_camera_light(eye)] if scene.camera_light else []
     places = [light.world_from_light for light in lights]
     n = len(lights)
@@ -32,7 +38,7 @@ def pack_lights(scene: Scene, eye: NDArray[np.float64]) -> LightTable:
     return LightTable(
         kind=np.array([light.kind for light in lights], np.int32),
         axes=np.array([[m[:3, 0], m[:3, 1], -m[:3, 2], m[:3, 3]] for m in places], np.float64).reshape(n, 4, 3),
-        size=np.array([np.multiply(x.size, KINDS[x.kind].size_factor) for x in lights], np.float64).reshape(n, 2),
+        size=np.array([np.multiply(x.size, _size_factor(x.kind)) for x in lights], np.float64).reshape(n, 2),
         radiance=np.array([light.radiance for light in lights], np.float64).reshape(n, 3),
         diffuse=np.array([light.diffuse for light in lights], np.float64),
         specular=np.array([light.specular for light in lights], np.float64),
@@ -44,6 +50,8 @@ def pack_lights(scene: Scene, eye: NDArray[np.float64]) -> LightTable:
         caster_shift=np.array(shifts, np.int32),
         link=np.array([-1 if light.lit is None else groups.index(light.lit) for light in lights], np.int32),
         linked=_linked(scene, groups),
+        root=np.array(roots + [-1] * (n - len(roots)), np.int32),
+        glow=glow.tree if glow else no_glow(),
     )
 
 
@@ -53,6 +61,10 @@ def _linked(scene: Scene, groups: list[tuple[str, ...]]) -> NDArray[np.uint8]:
         return np.zeros((0, 0), np.uint8)
     paths = [prim_of(mesh.path) for mesh in scene.meshes] + [prim_of(ball.path) for ball in scene.spheres]
     return np.array([[path in group for path in paths] for group in map(frozenset, groups)], np.uint8)
+
+
+def _size_factor(kind: LightKind) -> tuple[float, float]:
+    return KINDS[kind].size_factor if kind in KINDS else (1.0, 1.0)
 
 
 def _is_even(shaping: Shaping) -> bool:

@@ -20,8 +20,10 @@ from ..kernels.arrays import F32_1D, F64_1D, F64_2D, F64_3D, I32_1D, I64_2D, U8_
 from ..kernels.choice import choice
 from ..kernels.compile import inlined, leaf
 from ..kernels.vec import Vec, add, cross, dot, frame, length, lerp, normalize, row, scale, sub
-from ..optics.lobes import ggx, smith_visibility
+from ..optics.lobes import ggx, sample_cosine, smith_visibility
 from ..scene import LightKind
+from .glow import GlowTree, glow_irradiance, glow_target
+from .polygon import polygon_edge
 
 _DISK_SIDES = 12
 """A disk's irradiance is that of the regular polygon with as many sides and the disk's area."""
@@ -86,6 +88,9 @@ class LightTable(NamedTuple):
     """shape (L,): row of `linked`; -1 where it lights everything"""
     linked: U8_2D
     """shape (R, things): 1 where it lights a thing"""
+    root: I32_1D
+    """shape (L,): the node of `glow` that it is all of; -1 of every other kind"""
+    glow: GlowTree
 
 
 class Lamp(NamedTuple):
@@ -114,19 +119,50 @@ def lamp_of(lights: LightTable, which: int) -> Lamp:
 
 
 @inlined
-def shadow_ray(lights: LightTable, which: int, p: Vec, u1: float, u2: float) -> tuple[Vec, float]:
-    """(direction, distance) from `p` to one point of a light; distance is along the unit direction [m].
+def shadow_ray(lights: LightTable, which: int, p: Vec, n: Vec, u1: float, u2: float) -> tuple[Vec, float, float]:
+    """(direction, distance, weight) from `p` to one point of a light; distance is along the unit direction [m].
 
     Points are spread evenly over the light's area as `p` sees it (of a sphere: over the disk it shows), which is what
-    the share of it that is hidden has to be measured by. `u1`, `u2`: 0 .. 1.
+    the share of it that is hidden has to be measured by, and weigh 1. Those of what glows are spread by what they bring
+    to a surface with normal `n`, about, and weigh what they really bring. `u1`, `u2`: 0 .. 1.
     """
-    return target_on(lights.kind[which], lamp_of(lights, which), p, u1, u2)
+    if lights.kind[which] == LightKind.GLOW.value:
+        point, worth = glow_target(lights.glow, lights.root[which], p, n, u1, u2)
+        direction, distance = _towards(p, point)
+        return direction, distance, worth * max(0.0, dot(direction, n))
+    direction, distance = target_on(lights.kind[which], lamp_of(lights, which), p, n, u1, u2)
+    return direction, distance, 1.0
+
+
+@inlined
+def is_flat(lights: LightTable, which: int) -> bool:
+    """It shines from a piece of a plane, to one side."""
+    flat = lights.kind[which] == LightKind.RECT.value or lights.kind[which] == LightKind.DISK.value
+    return flat and lights.size[which, 0] > 0.0
+
+
+@inlined
+def drawn_ray(lights: LightTable, which: int, p: Vec, n: Vec, u1: float, u2: float) -> tuple[Vec, float, float]:
+    """As `shadow_ray`, but in the place of the weight the irradiance per radiance [sr] as that one point tells it, of
+    which the mean is right: what comes from a flat light, or from what glows, is far from even where it is near. Other
+    lights are taken to bring as much from all of theirs."""
+    direction, distance, worth = shadow_ray(lights, which, p, n, u1, u2)
+    if lights.kind[which] == LightKind.GLOW.value:
+        return direction, distance, worth
+    if not is_flat(lights, which):
+        return direction, distance, irradiance_factor(lights, which, p, n)
+    a, b = lights.size[which, 0], lights.size[which, 1]
+    area = 4.0 * a * b if lights.kind[which] == LightKind.RECT.value else math.pi * a * a
+    facing = max(0.0, -dot(direction, row(lights.axes[which], 2)))
+    return direction, distance, area * facing * max(0.0, dot(direction, n)) / (distance * distance)
 
 
 @inlined
 def irradiance_factor(lights: LightTable, which: int, p: Vec, n: Vec) -> float:
     """Unoccluded irradiance at `p` on a surface with normal `n`, per radiance of a light [sr]: the integral of the
     cosine over the directions that the light fills, horizon included. Without size, the limit's own unit."""
+    if lights.kind[which] == LightKind.GLOW.value:
+        return glow_irradiance(lights.glow, lights.root[which], p, n)
     return _irradiance(lights.kind[which], lamp_of(lights, which), p, n)
 
 
@@ -139,7 +175,7 @@ def highlight(lights: LightTable, which: int, p: Vec, n: Vec, wo: Vec, alpha: fl
     radius and dimmed to the same energy (Karis 2013, "representative point"), times the solid angle it stands for.
     """
     n_dot_v = dot(n, wo)
-    if n_dot_v <= 0.0:
+    if n_dot_v <= 0.0 or lights.kind[which] == LightKind.GLOW.value:  # mirrors see what glows itself
         return 0.0
     r = sub(scale(n, 2.0 * n_dot_v), wo)
     point, inside, solid, radius = nearest_to(lights.kind[which], lamp_of(lights, which), p, r)
@@ -179,7 +215,7 @@ def _on_disk(centre: Vec, x: Vec, y: Vec, radius: float, u1: float, u2: float) -
 
 
 @inlined
-def _distant_target(lamp: Lamp, p: Vec, u1: float, u2: float) -> tuple[Vec, float]:
+def _distant_target(lamp: Lamp, p: Vec, n: Vec, u1: float, u2: float) -> tuple[Vec, float]:
     """Within the cone of half angle `a`; no point of it is any nearer than another."""
     to = scale(lamp.face, -1.0)
     if lamp.a > 0.0:
@@ -190,7 +226,7 @@ def _distant_target(lamp: Lamp, p: Vec, u1: float, u2: float) -> tuple[Vec, floa
 
 
 @inlined
-def _sphere_target(lamp: Lamp, p: Vec, u1: float, u2: float) -> tuple[Vec, float]:
+def _sphere_target(lamp: Lamp, p: Vec, n: Vec, u1: float, u2: float) -> tuple[Vec, float]:
     """On the disk through its middle that it shows to `p`."""
     target = lamp.centre
     if lamp.a > 0.0:
@@ -200,13 +236,13 @@ def _sphere_target(lamp: Lamp, p: Vec, u1: float, u2: float) -> tuple[Vec, float
 
 
 @inlined
-def _rect_target(lamp: Lamp, p: Vec, u1: float, u2: float) -> tuple[Vec, float]:
+def _rect_target(lamp: Lamp, p: Vec, n: Vec, u1: float, u2: float) -> tuple[Vec, float]:
     across = add(scale(lamp.x, (2.0 * u1 - 1.0) * lamp.a), scale(lamp.y, (2.0 * u2 - 1.0) * lamp.b))
     return _towards(p, add(lamp.centre, across))
 
 
 @inlined
-def _disk_target(lamp: Lamp, p: Vec, u1: float, u2: float) -> tuple[Vec, float]:
+def _disk_target(lamp: Lamp, p: Vec, n: Vec, u1: float, u2: float) -> tuple[Vec, float]:
     target = lamp.centre
     if lamp.a > 0.0:
         target = _on_disk(lamp.centre, lamp.x, lamp.y, lamp.a, u1, u2)
@@ -225,7 +261,7 @@ def across(lamp: Lamp, p: Vec) -> tuple[float, float, Vec]:
 
 
 @inlined
-def _cylinder_target(lamp: Lamp, p: Vec, u1: float, u2: float) -> tuple[Vec, float]:
+def _cylinder_target(lamp: Lamp, p: Vec, n: Vec, u1: float, u2: float) -> tuple[Vec, float]:
     """On the rectangle through its axis that it shows to `p`."""
     _, _, w = across(lamp, p)
     side = cross(lamp.x, w)
@@ -234,7 +270,19 @@ def _cylinder_target(lamp: Lamp, p: Vec, u1: float, u2: float) -> tuple[Vec, flo
 
 
 @inlined
-def _camera_target(lamp: Lamp, p: Vec, u1: float, u2: float) -> tuple[Vec, float]:
+def _ball_target(lamp: Lamp, p: Vec, n: Vec, u1: float, u2: float) -> tuple[Vec, float]:
+    """On the face of a sphere that is there itself: where a ray to the disk that it shows meets it. From within, where
+    all shines, by the cosine."""
+    c = sub(lamp.centre, p)
+    beyond = dot(c, c) - lamp.a * lamp.a
+    d = _sphere_target(lamp, p, n, u1, u2)[0] if beyond > 0.0 else sample_cosine(n, u1, u2)
+    ahead = dot(c, d)
+    root = math.sqrt(max(0.0, ahead * ahead - beyond))
+    return d, ahead - root if beyond > 0.0 else ahead + root
+
+
+@inlined
+def _camera_target(lamp: Lamp, p: Vec, n: Vec, u1: float, u2: float) -> tuple[Vec, float]:
     return _towards(p, lamp.centre)
 
 
@@ -307,30 +355,6 @@ def _flat_irradiance(lamp: Lamp, p: Vec, n: Vec, half_height: float, sides: int)
 
 
 @inlined
-def _angle_over_sine(x: float) -> float:
-    """acos(x) / sqrt(1 - x * x) for x in 0 .. 1, where it is 1 at the end, to 1e-7 of it: a Chebyshev fit, in an order
-    without a long chain. A call of acos takes longer than all the rest of an edge."""
-    x2 = x * x
-    low = (1.5707962222 - 0.99998225999 * x) + (0.78489625578 - 0.66108945254 * x) * x2
-    high = (0.55702205608 - 0.4245661869 * x) + (0.25323847676 - 0.097968704053 * x) * x2
-    return low + (high + 0.017653667906 * (x2 * x2)) * (x2 * x2)
-
-
-@inlined
-def _polygon_edge(a: Vec, b: Vec, n: Vec) -> float:
-    """One edge of Lambert's formula for two unit directions and the receiver's normal: the angle between the two, times
-    the cosine of the receiver to the plane that they span."""
-    cosine = min(1.0, max(-1.0, dot(a, b)))
-    axis = cross(a, b)
-    across = dot(axis, n)
-    angle = _angle_over_sine(abs(cosine))
-    if cosine >= 0.0:
-        return angle * across
-    sine = length(axis)  # past a right angle: acos(-x) = pi - acos(x)
-    return (math.pi / sine - angle) * across if sine > 1e-9 else 0.0
-
-
-@inlined
 def _corner(c: Vec, x: Vec, y: Vec, k: int, sides: int) -> Vec:
     """Corner `k` of the parallelogram with half axes x, y, or of the regular polygon with the area of their ellipse."""
     if sides == 4:
@@ -363,10 +387,10 @@ def _polygon_irradiance(p: Vec, n: Vec, centre: Vec, x: Vec, y: Vec, sides: int)
             else:
                 start = entering = crossing
         if ha > 0.0 or hb > 0.0:
-            total += _polygon_edge(start, end, n)
+            total += polygon_edge(start, end, n)
         a = b
     if cut:  # the edge along the horizon, which closes what is left of the polygon
-        total += _polygon_edge(leaving, entering, n)
+        total += polygon_edge(leaving, entering, n)
     return abs(total) * 0.5
 
 
@@ -397,15 +421,15 @@ def _cylinder_irradiance(lamp: Lamp, p: Vec, n: Vec) -> float:
             else:
                 start = crossing
                 if left:
-                    total += _polygon_edge(leaving, crossing, n)
+                    total += polygon_edge(leaving, crossing, n)
                 else:
                     first, entered = crossing, True
                 left = False
         if ha > 0.0 or hb > 0.0:
-            total += _polygon_edge(start, end, n)
+            total += polygon_edge(start, end, n)
         a = b
     if left and entered:
-        total += _polygon_edge(leaving, first, n)
+        total += polygon_edge(leaving, first, n)
     return abs(total) * 0.5
 
 
@@ -550,13 +574,19 @@ def _camera_nearest(lamp: Lamp, p: Vec, r: Vec) -> Nearest:
     return sub(lamp.centre, p), False, 1.0, 0.0
 
 
+@inlined
+def _not_near(lamp: Lamp, p: Vec, r: Vec) -> Nearest:
+    """It has no highlight: it is there itself, for mirrors to see."""
+    return sub(lamp.centre, p), False, 0.0, 0.0
+
+
 # --- one row per kind -----------------------------------------------------------------------------------------------
 
 
 class Kind(NamedTuple):
     """How lights of one kind shine."""
 
-    target: Callable[[Lamp, Vec, float, float], tuple[Vec, float]]
+    target: Callable[[Lamp, Vec, Vec, float, float], tuple[Vec, float]]
     """as `shadow_ray`"""
     irradiance: Callable[[Lamp, Vec, Vec], float]
     """as `irradiance_factor`"""
@@ -573,6 +603,7 @@ KINDS = {
     LightKind.DISK: Kind(_disk_target, _disk_irradiance, _disk_nearest),
     LightKind.CYLINDER: Kind(_cylinder_target, _cylinder_irradiance, _cylinder_nearest, (1.0, 0.5)),
     LightKind.CAMERA: Kind(_camera_target, _camera_irradiance, _camera_nearest),
+    LightKind.BALL: Kind(_ball_target, _sphere_irradiance, _not_near),
 }
 _CAMERA = KINDS[LightKind.CAMERA]
 target_on = choice({kind: one.target for kind, one in KINDS.items()}, _CAMERA.target)

@@ -75,6 +75,8 @@ class Block(NamedTuple):
     """share of the sky that the material lets in, 0 .. 1"""
     matte: Flags
     """1 where diffuse light is asked for; 0 leaves `diffuse` at nothing, and saves its shadow rays"""
+    spreads: Flags
+    """1 where the material sends any of it back"""
     rays: Words
     """that go to each light and to the sky; 1, unless somebody wants more"""
     lobes: Words
@@ -112,6 +114,9 @@ class Block(NamedTuple):
     """1 where it would bring anything, and casts shadows"""
     lamp_seen: Vectors
     """share of its light that arrives, colour by colour, 0 .. 1"""
+    lamp_weight: Scalars
+    """for how much the last ray to it counts, and the sum of all of them"""
+    lamp_weights: Scalars
     free: Vectors
     """the same of one point of it, or of the sky"""
 
@@ -173,6 +178,7 @@ def load_surface(block: Block, lane: int, at: Interaction, world: World, wo: Vec
     block.coat_roughness[lane] = share_input(world, at, Param.CLEARCOAT_ROUGHNESS.value)
     block.occlusion[lane] = share_input(world, at, Param.OCCLUSION.value)
     block.matte[lane] = block.rays[lane] = block.lobes[lane] = 1
+    block.spreads[lane] = world.materials.spreads[at.hit.material]
 
 
 @inlined
@@ -208,6 +214,7 @@ def paint(at: Interaction, world: World, share: Vec) -> tuple[Vec, Vec]:
 def copy_lane(to: Block, i: int, block: Block, lane: int) -> None:
     """A surface, and the light that has been gathered for it, into another block."""
     to.on[i], to.matte[i], to.thing[i] = block.on[lane], block.matte[lane], block.thing[lane]
+    to.spreads[i] = block.spreads[lane]
     put(to.point, i, row(block.point, lane))
     put(to.ng, i, row(block.ng, lane))
     put(to.ns, i, row(block.ns, lane))
@@ -254,6 +261,7 @@ def _gather_lights(block: Block, packet: Packet, world: World, mask: int) -> Non
             put(block.lamp_seen, lane, (1.0, 1.0, 1.0))
             if block.on[lane] != 0 and aim_light(block, lane, lights, l) and lights.casts_shadow[l] != 0:
                 block.lamp_asked[lane] = 1
+                block.lamp_weights[lane] = 0.0
                 put(block.lamp_seen, lane, (0.0, 0.0, 0.0))
         most = 0
         for lane in range(LANES):
@@ -264,15 +272,24 @@ def _gather_lights(block: Block, packet: Packet, world: World, mask: int) -> Non
             for lane in range(LANES):
                 if block.lamp_asked[lane] != 0 and k < block.rays[lane]:
                     key = nth(key_of(block.key, lane), k, block.rays[lane])
-                    add_light_ray(block, lane, lights, l, packet, lane, key)
+                    block.lamp_weight[lane] = add_light_ray(block, lane, lights, l, packet, lane, key)
             lamp_visible(packet, world, mask, l, block.free)
             for lane in range(LANES):
                 if block.lamp_asked[lane] != 0 and k < block.rays[lane]:
-                    share = along(row(block.lamp_seen, lane), row(block.free, lane), 1.0 / block.rays[lane])
-                    put(block.lamp_seen, lane, share)
+                    weight = block.lamp_weight[lane]
+                    block.lamp_weights[lane] += weight
+                    put(block.lamp_seen, lane, along(row(block.lamp_seen, lane), row(block.free, lane), weight))
         for lane in range(LANES):
+            if block.lamp_asked[lane] != 0:
+                put(block.lamp_seen, lane, share_of_lamp(row(block.lamp_seen, lane), block.lamp_weights[lane]))
             if block.on[lane] != 0:
                 add_light(block, lane, lights, l)
+
+
+@inlined
+def share_of_lamp(seen: Vec, weights: float) -> Vec:
+    """The share of a light that arrives: what rays have seen of it, each by its weight; all where none counts."""
+    return scale(seen, 1.0 / weights) if weights > 0.0 else (1.0, 1.0, 1.0)
 
 
 @inlined
@@ -288,7 +305,7 @@ def aim_light(block: Block, lane: int, lights: LightTable, l: int) -> bool:  # n
     if not _links(block, lane, lights, l):
         return False
     p, n, wo = row(block.point, lane), row(block.ns, lane), row(block.wo, lane)
-    if block.matte[lane] != 0:
+    if block.matte[lane] != 0 and block.spreads[lane] != 0:
         block.lamp_diffuse[lane] = irradiance_factor(lights, l, p, n) * lights.diffuse[l]
     gloss = block.roughness[lane]
     block.lamp_specular[lane] = highlight(lights, l, p, n, wo, gloss * gloss) * lights.specular[l]
@@ -325,14 +342,15 @@ def _shape(block: Block, lane: int, lights: LightTable, l: int) -> None:  # noqa
 @inlined
 def add_light_ray(
     block: Block, i: int, lights: LightTable, l: int, packet: Packet, lane: int, key: Key  # noqa: E741
-) -> None:
-    """Put a ray from hit `i` to a point of a light into a lane."""
+) -> float:
+    """Put a ray from hit `i` to a point of a light into a lane. Returns for how much it counts among others."""
     u1, u2 = unit_pair(key, Purpose.LIGHT.value + l)
     p = row(block.point, i)
-    direction, distance = shadow_ray(lights, l, p, u1, u2)
+    direction, distance, weight = shadow_ray(lights, l, p, row(block.ns, i), u1, u2)
     if lights.reach[l, 0] < math.inf:
         distance = min(distance, _shadow_length(lights, l, key))
     add_shadow_ray(packet, lane, p, row(block.ng, i), direction, distance)
+    return weight
 
 
 @inlined

@@ -52,7 +52,7 @@ def shape_matt(lights: LightTable, which: int, p: Vec, n: Vec) -> Vec:
     for i in range(firsts):
         for j in range(seconds):
             u, v = (i + 0.5) / firsts, (j + 0.5) / seconds
-            d, away = target_on(kind, lamp, p, u, v)
+            d, away = target_on(kind, lamp, p, n, u, v)
             weight = max(0.0, dot(d, n)) * max(0.0, dot(d, face)) / (away * away)
             if weight <= 0.0:
                 continue

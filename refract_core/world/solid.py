@@ -68,6 +68,17 @@ def encloses(points: NDArray[np.floating], triangles: NDArray[np.integer], point
     return winding(point, points.astype(np.float64), triangles) > 0.5
 
 
+def along_a_curve(points: F64) -> NDArray[np.int64]:
+    """Order of points along Morton's curve: those next to each other are so in space, so that strata are, too."""
+    low, size = points.min(axis=0), max(float(np.ptp(points, axis=0).max()), 1e-30)
+    cells = ((points - low) / size * 1023.0).astype(np.int64)
+    code = np.zeros(len(points), np.int64)
+    for bit in range(10):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return np.argsort(code, kind="stable")
+
+
 def crossings(corners: F64, origin: F64, direction: F64) -> tuple[F64, NDArray[np.bool_]]:
     """Where a ray meets triangles (Moeller and Trumbore, Journal of Graphics Tools 2(1), 1997).
 

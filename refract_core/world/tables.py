@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..errors import SceneError
 from ..kernels.arrays import F32_1D, F32_2D, F32_3D, I32_1D, I32_2D, I32_3D, I64_1D, I64_2D, U8_1D, U32_2D
 from ..models import BY_TOKEN
-from ..scene import Material, Mesh, Model, Param, Scene, Source, Sphere
+from ..scene import Material, Mesh, Model, Param, Scene, Source, Sphere, prim_of
 from . import embree
 from .caustics import Caustics, no_caustics
 from .embree import (
@@ -97,6 +97,8 @@ class MaterialTable(NamedTuple):
     abbe: F32_1D
     priority: I32_1D
     """as `refraction:priority`"""
+    spreads: U8_1D
+    """1 where a surface may send light back diffusely"""
     gleams: U8_1D
     """1 where what a surface shows depends on where it is seen from"""
 
@@ -178,8 +180,15 @@ def pack_materials(materials: Sequence[Material], slots: dict[str, int], drawn_a
         absorption_distance=per_material(lambda m: m.absorption_distance, np.float32),
         abbe=per_material(lambda m: m.abbe, np.float32),
         priority=per_material(lambda m: m.priority, np.int32),
+        spreads=per_material(_spreads, np.uint8),
         gleams=per_material(_gleams, np.uint8),
     )
+
+
+def _spreads(material: Material) -> bool:
+    """Not all of it is black."""
+    source = material.inputs[Param.DIFFUSE]
+    return source.texture >= 0 or bool(source.primvar) or any(source.value[:3])
 
 
 def _gleams(material: Material) -> bool:
@@ -313,9 +322,11 @@ def _touched(pile: _Pile) -> NDArray[np.uint8]:
     return touched
 
 
-def prim_of(path: str) -> str:
-    """The prim that a path belongs to: instances of a PointInstancer are drawn as `/Instancer/[7]/...`."""
-    return path.partition("/[")[0]
+def rows_of(geometry: Geometry, part: int) -> slice:
+    """A part's primitives, as rows of `Geometry.triangles`."""
+    first = geometry.first
+    last = first[part + 1] if part + 1 < len(first) else len(geometry.triangles)
+    return slice(int(first[part]), int(last))
 
 
 def caster_sets(scene: Scene) -> list[frozenset[str]]:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
-from ...scene import Material, Mesh, Notice, Param, Source
+from ...scene import Material, Mesh, Notice, Param, Source, prim_of
 from .context import Context, note, value
 from .emission import emission
 
@@ -36,14 +36,18 @@ def glowing(
     """
     context = Context(time, UsdGeom.XformCache(time), np.eye(4), metres_per_unit, notices)
     lights: dict[str, Usd.Prim] = {}
+    drawn = {prim_of(mesh.path) for mesh in meshes}
     for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
         if is_mesh_light(prim):
-            for path in _targets(prim):
+            targets = _targets(prim)
+            if not any(str(path) in drawn for path in targets):
+                note(context, prim, f"{prim.GetTypeName()} has no mesh that is drawn, so it gives no light")
+            for path in targets:
                 if _own_glow(stage.GetPrimAtPath(path), prim):
                     lights[str(path)] = prim
     if not lights:
         return meshes
-    return tuple(_lit(context, mesh, lights.get(mesh.path.partition("/[")[0]), materials) for mesh in meshes)
+    return tuple(_lit(context, mesh, lights.get(prim_of(mesh.path)), materials) for mesh in meshes)
 
 
 def _targets(prim: Usd.Prim) -> Sequence[Sdf.Path]:

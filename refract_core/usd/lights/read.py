@@ -87,8 +87,7 @@ def _read_light(
     name = str(prim.GetTypeName())
     if name not in ROWS and name not in _DOMES:
         label = "MeshLightAPI" if prim.HasAPI(UsdLux.MeshLightAPI) else name or "LightAPI"
-        if is_mesh_light(prim):
-            note(context, prim, f"{label} glows, but lights nothing else")
+        if is_mesh_light(prim):  # what it makes glow is a light
             return
         hint = " (sampling of the dome goes on without it)" if name == "PortalLight" else ""
         note(context, prim, f"{label} is ignored: it is not rendered as a light{hint}")
