@@ -141,6 +141,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.include_router(routes.router)
     app.include_router(thumbnails.router)
     openapi.describe(app, tokens=bool(settings.tokens))
+    app.mount("/static/swagger", _Static(packages=[("fastapi_swagger", "resources")]), name="viewer")
     app.mount("/static", _Static(directory=_STATIC), name="static")
     return app
 

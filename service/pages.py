@@ -1,4 +1,5 @@
-"""The words the page knows, and pages without scripts: /docs from the OpenAPI document, and one per problem type."""
+"""The words the page knows; /docs, which has a viewer of the OpenAPI document, and its text where scripts are off; and
+a page per problem type."""
 
 from __future__ import annotations
 
@@ -13,9 +14,14 @@ from .limits import Limits, table
 from .problems import KINDS
 
 _HEAD = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
-<title>{title}</title><link rel="stylesheet" href="/static/page.css"><main>
+<title>{title}</title><link rel="icon" type="image/svg+xml" href="/static/icon.svg">
+<link rel="stylesheet" href="/static/page.css"><main>
 <h1>{title}</h1>
 """
+
+
+_VIEWER = """<link rel="stylesheet" href="static/swagger/swagger-ui.css"><div id="viewer"></div>
+<script src="static/swagger/swagger-ui-bundle.js"></script><script src="static/docs.js"></script>"""
 
 
 def words() -> str:
@@ -34,10 +40,10 @@ def problem_page(slug: str) -> str:
 
 
 def docs_page(document: dict[str, Any], limits: Limits) -> str:
-    """Every operation, limit and problem type."""
-    parts = [_HEAD.format(title="refract over HTTP"), '<p>As a document: <a href="/openapi.json">openapi.json</a>.</p>',
-             "<pre>curl -F stage=@glass.usdz http://127.0.0.1:8000/v1/render -o glass.png</pre>"]  # fmt: skip
-    parts.append(f"<p>{escape(document['info']['description'])}</p>")
+    """Every operation, to be read and tried, and every limit and problem type."""
+    parts = [_HEAD.format(title="refract over HTTP"), '<p>As a document: <a href="openapi.json">openapi.json</a>.</p>',
+             "<pre>curl -F stage=@glass.usdz http://127.0.0.1:8000/v1/render -o glass.png</pre>", _VIEWER]  # fmt: skip
+    parts.append(f"<noscript><p>{escape(document['info']['description'])}</p>")
     if "securitySchemes" in document["components"]:
         parts.append("<p>This service asks for a token: send <code>Authorization: Bearer TOKEN</code>.</p>")
     for path, operations in document["paths"].items():
@@ -54,7 +60,7 @@ def docs_page(document: dict[str, Any], limits: Limits) -> str:
             for media, content in one.get("requestBody", {}).get("content", {}).items():
                 schema = escape(json.dumps(content["schema"], indent=1))
                 parts.append(f"<details><summary>{escape(media)}</summary><pre>{schema}</pre></details>")
-    parts.append('<h2 id="limits">Limits</h2><table><tr><th>name<th>value<th>unit<th>meaning<th>environment')
+    parts.append('</noscript><h2 id="limits">Limits</h2><table><tr><th>name<th>value<th>unit<th>meaning<th>environment')
     for row in table(limits):
         cells = (row["name"], row["value"], row["unit"], row["meaning"], row["variable"])
         parts.append("<tr>" + "".join(f"<td>{escape(str(cell))}" for cell in cells))

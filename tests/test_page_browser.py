@@ -367,6 +367,23 @@ def test_against_the_real_service(browser: Any, real_url: str) -> None:
     opened.close()
 
 
+def test_every_operation_can_be_tried_on_the_page_of_the_interface(browser: Any, real_url: str) -> None:
+    """Under the policy that all pages have: no script or style but the service's own."""
+    opened = browser.new_page()
+    opened.set_default_timeout(PATIENCE)
+    wrong: list[str] = []
+    opened.on("pageerror", lambda error: wrong.append(str(error)))
+    opened.on("console", lambda line: wrong.append(line.text) if line.type == "error" else None)
+    opened.goto(f"{real_url}docs")
+    playwright.expect(opened.get_by_text("/v1/render", exact=True)).to_be_visible()
+    opened.get_by_text("/v1/limits", exact=True).click()
+    opened.get_by_role("button", name="Try it out").click()
+    opened.get_by_role("button", name="Execute").click()
+    playwright.expect(opened.locator(".live-responses-table")).to_contain_text("job_seconds")
+    assert not wrong
+    opened.close()
+
+
 def test_a_page_of_a_name_bound_anew_is_shown_nothing(browser: Any, real_url: str) -> None:
     """DNS rebinding: this browser is told that evil.test is this machine."""
     port = real_url.rstrip("/").rpartition(":")[2]
