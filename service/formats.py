@@ -1,13 +1,10 @@
-"""Formats of pictures: what a request calls them, their media types, and which of them can be written here."""
+"""Formats of pictures: what a request calls them, and their media types."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from functools import cache
 from typing import NamedTuple
-
-from refract_core.images import codec
 
 from .problems import Problem
 
@@ -32,12 +29,6 @@ BY_EXTENSION = {one.extension: one for one in FORMATS.values()}
 MEDIA = tuple(one.media for one in FORMATS.values())
 
 
-@cache
-def written(name: str) -> bool:
-    """Whether this machine's image library writes a format: AVIF needs one that was built with libheif."""
-    return name != "avif" or codec.writes(f".{FORMATS[name].extension}")
-
-
 def format_of(accept: str, asked: str) -> str:
     """Name of the format of an answer.
 
@@ -49,14 +40,9 @@ def format_of(accept: str, asked: str) -> str:
         Problem: 406, with what can be given.
     """
     possible = [asked] if asked else list(FORMATS)
-    lacking = ""
-    if ("avif" in accept.lower() or asked == "avif") and not written("avif"):
-        possible = [name for name in FORMATS if name != "avif" and asked in ("", name)]
-        lacking = "; image/avif is not written here, where OpenImageIO was built without libheif"
     media = accepted(accept, [FORMATS[name].media for name in possible])
     if not media:
-        known = " or ".join(FORMATS[name].media for name in possible or FORMATS if name != "avif" or written(name))
-        raise Problem("not-acceptable", f"this can be given as {known}{lacking}")
+        raise Problem("not-acceptable", f"this can be given as {' or '.join(FORMATS[name].media for name in possible)}")
     return next(name for name in possible if FORMATS[name].media == media)
 
 

@@ -5,6 +5,7 @@ OpenImageIO is loaded with the first file, never with this module.
 
 from __future__ import annotations
 
+import io
 import os
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -200,15 +201,6 @@ def exr_spec(
     return spec
 
 
-def writes(extension: str) -> bool:
-    """Whether this OpenImageIO can write a format, by the extension of its files; some are left out of some builds."""
-    import OpenImageIO as oiio
-
-    formats = set(str(oiio.get_string_attribute("output_format_list")).split(","))
-    known = (one.partition(":") for one in str(oiio.get_string_attribute("extension_list")).split(";"))
-    return any(name in formats and extension[1:] in extensions.split(",") for name, _, extensions in known)
-
-
 def encoded(path: str, pixels: NDArray[Any], spec: Any) -> bytes:
     """The whole file in memory: on a full disk some writers say nothing, and one ends the process.
 
@@ -216,6 +208,8 @@ def encoded(path: str, pixels: NDArray[Any], spec: Any) -> bytes:
         path: whose extension says which format.
         spec: OpenImageIO's description of it.
     """
+    if extension_of(path) == ".avif":
+        return _avif(path, pixels)
     import OpenImageIO as oiio
 
     with memory_file() as name:
@@ -231,3 +225,16 @@ def encoded(path: str, pixels: NDArray[Any], spec: Any) -> bytes:
     if extension_of(path) == ".png" and not data.endswith(b"IEND\xaeB`\x82"):  # the last chunk of every PNG
         raise ImageError(f"{path}: cannot be encoded: out of memory, or over the limit on file sizes")
     return data
+
+
+def _avif(path: str, pixels: NDArray[np.uint8]) -> bytes:
+    """By Pillow: OpenImageIO's packages are built without the library for it."""
+    from PIL import Image
+
+    data = io.BytesIO()
+    whole = pixels[..., 0] if pixels.shape[2] == 1 else pixels
+    try:
+        Image.fromarray(np.ascontiguousarray(whole)).save(data, "AVIF", quality=90, max_threads=1)
+    except (OSError, ValueError, RuntimeError, KeyError) as error:
+        raise ImageError(f"{path}: cannot be encoded: {error}") from None
+    return data.getvalue()

@@ -22,7 +22,6 @@ from .codec import (
     read_channels,
     read_pixels,
     reason,
-    writes,
 )
 from .srgb import srgb_decode, srgb_encode
 
@@ -30,8 +29,6 @@ COLOR_SPACES = ("auto", "raw", "sRGB")
 COLOR_CORRECTIONS = ("disabled", "sRGB", "openColorIO")
 LAYERED = (".exr",)
 EIGHT_BIT = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".avif")
-_WITH_LIBHEIF = (".avif",)
-"""Written where OpenImageIO was built with that library, which its packages on PyPI are not."""
 _PNG_LEVEL, _PNG_SUB = 4, 0x10
 """zlib's level, and libpng's flag for differences to the left neighbour: written in half the time the defaults take, at
 about the same size."""
@@ -226,8 +223,6 @@ def _extension(path: str) -> str:
     if extension not in LAYERED + EIGHT_BIT:
         known = ", ".join(LAYERED + EIGHT_BIT)
         raise UsageError(f"{path}: '{extension}' is not a known image extension; use one of {known}")
-    if extension in _WITH_LIBHEIF and not writes(extension):
-        raise UsageError(f"{path}: this OpenImageIO was built without libheif and knows no {extension}; use .webp")
     return extension
 
 
@@ -267,8 +262,8 @@ def _eight_bit(
         spec.attribute("oiio:ColorSpace", "srgb_rec709_scene")
     if extension in (".jpg", ".jpeg"):
         spec.attribute("Compression", "jpeg:95")
-    if extension in (".webp", ".avif"):
-        spec.attribute("Compression", f"{extension[1:]}:90")
+    if extension == ".webp":
+        spec.attribute("Compression", "webp:90")
     if extension == ".png":
         spec.attribute("png:compressionLevel", _PNG_LEVEL)
         spec.attribute("png:filter", _PNG_SUB)
