@@ -27,6 +27,7 @@ ORACLE = "tests/test_oracle.py"
 LAWS = "tests/test_render_laws.py"
 CORNERS = ("tests/test_corners.py",)
 CAUSTICS = ("tests/test_caustics.py", "tests/test_shading.py", ORACLE)
+GLOWS = ("tests/test_emission.py",)
 TREE = "tests/test_tree.py"
 SCREEN = (TREE, LAWS, "tests/test_screen.py", "tests/test_shading.py", "tests/test_nothing_invented.py")
 COPIED = (
@@ -197,7 +198,7 @@ MUTANTS = (
            "return 0.5 - math.atan2(x, z) / (2.0 * math.pi)", "return 0.5 + math.atan2(x, z) / (2.0 * math.pi)",
            (ORACLE, "tests/test_environment.py")),
     Mutant("a light's horizon is not clipped", "world/lights.py",
-           "        total += _polygon_edge(leaving, entering, n)", "        total += 0.0",
+           "        total += polygon_edge(leaving, entering, n)", "        total += 0.0",
            (ORACLE, "tests/test_lights.py")),
     # --- physics
     Mutant("Fresnel of one polarisation", "optics/interface.py",
@@ -264,8 +265,8 @@ MUTANTS = (
     Mutant("a seam where the axis changes", "world/caustics.py",
            "share = max(0.0, n[axis] * n[axis] - _AXIS_SHARE * _AXIS_SHARE)",
            "share = 1.0 if axis == _main_axis(n) else 0.0", CAUSTICS),
-    Mutant("flat lights are even however near", "transport/photons.py",
-           "if not flat or a <= 0.0:", "if True:", CAUSTICS),
+    Mutant("flat lights are even however near", "world/lights.py",
+           "if not is_flat(lights, which):", "if True:", CAUSTICS),
     Mutant("photons fall through what stands before a light", "transport/photons.py",
            "flux = mul(row(own.brought, lane), row(own.arrives, lane))", "flux = row(own.brought, lane)", CAUSTICS),
     Mutant("glass that throws caustics lets light through, too", "world/tracing.py",
@@ -280,6 +281,23 @@ MUTANTS = (
            "scratch.cell.sample[slot] = first + lane, 0, 0", "scratch.cell.sample[slot] = 0, 0, 0", CAUSTICS),
     Mutant("every sample tosses the same coin", "world/tracing.py",
            "packet.sample[lane] * _GOLDEN % 1.0", "0.0", CAUSTICS),
+    # --- what glows
+    Mutant("what glows near the horizon is whole", "world/glow.py",
+           "total += polygon_edge(leaving, entering, n)", "total += 0.0", GLOWS),
+    Mutant("every node is far enough to be a point", "world/glow.py", "_FAR = 8.0", "_FAR = 1.0", GLOWS),
+    Mutant("every node is flat", "world/glow.py", "_FLAT = 0.985", "_FLAT = 0.0", GLOWS),
+    Mutant("what glows shines backwards, too", "world/glow.py",
+           "if toward > 0.0:\n                total += _tri", "if True:\n                total += _tri", GLOWS),
+    Mutant("points on what glows count alike", "world/lights.py",
+           "return direction, distance, worth * max(0.0, dot(direction, n))", "return direction, distance, 1.0", GLOWS),
+    Mutant("a sheet that glows has one side", "world/emitters.py", "if geometry.sheet[part] != 0:", "if False:", GLOWS),
+    Mutant("nobody is within what glows", "world/emitters.py",
+           "elif encloses(mesh.points, mesh.triangles, eye):", "elif False:", GLOWS),
+    Mutant("a cut-out glows whole", "world/emitters.py", "0.25 * _there(world, at))", "0.25)", GLOWS),
+    Mutant("a picture glows from its first triangle's middle", "world/emitters.py",
+           "np.where(driven != 0, cuts, 0)", "np.zeros_like(cuts)", GLOWS),
+    Mutant("things that share a light lose their weakest", "world/emitters.py",
+           "_FAINT = 1e-4", "_FAINT = 0.02", GLOWS),
 )  # fmt: skip
 
 

@@ -214,7 +214,9 @@ def plan_caustics(world: World, camera: Camera, settings: RenderSettings) -> Wan
     if settings.caustics == 0 or not _shadowing(world):
         return None
     casts = _throws_caustics(world)
-    if not casts.any() or (world.materials.model[world.geometry.material] != 0).all():
+    used = world.geometry.material
+    shows = (world.materials.model[used] == 0) & (world.materials.spreads[used] != 0)
+    if not casts.any() or not shows.any():
         return None
     width, _ = image_size(camera, settings.image_width, settings.image_height)
     return Wanted(casts, *_texels(world, casts, camera, width), settings.caustics)

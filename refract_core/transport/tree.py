@@ -334,7 +334,7 @@ def _meet_all(scratch: TreeScratch, world: World, view: View, rules: Rules, take
             cell.z_depth[i] = hit.t * dot(direction, row(view.axes, 2))
             cell.thickness[i] = meeting.thickness[lane]
             put(cell.normal, i, row(meeting.n, lane))
-        if meeting.kind[lane] != LEFT and (meeting.opacity[lane] > 0.0 or world.lights.kind.shape[0] > 0):
+        if meeting.kind[lane] != LEFT and (meeting.opacity[lane] > 0.0 or world.gleams):
             block = scratch.block
             load_surface(block, lane, at, world, scale(direction, -1.0))
             put(block.ns, lane, row(meeting.n, lane))

@@ -175,7 +175,7 @@ def highlight(lights: LightTable, which: int, p: Vec, n: Vec, wo: Vec, alpha: fl
     radius and dimmed to the same energy (Karis 2013, "representative point"), times the solid angle it stands for.
     """
     n_dot_v = dot(n, wo)
-    if n_dot_v <= 0.0 or lights.kind[which] == LightKind.GLOW.value:  # mirrors see what glows itself
+    if n_dot_v <= 0.0:
         return 0.0
     r = sub(scale(n, 2.0 * n_dot_v), wo)
     point, inside, solid, radius = nearest_to(lights.kind[which], lamp_of(lights, which), p, r)

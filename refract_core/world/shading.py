@@ -308,11 +308,13 @@ def aim_light(block: Block, lane: int, lights: LightTable, l: int) -> bool:  # n
     if block.matte[lane] != 0 and block.spreads[lane] != 0:
         block.lamp_diffuse[lane] = irradiance_factor(lights, l, p, n) * lights.diffuse[l]
     gloss = block.roughness[lane]
-    block.lamp_specular[lane] = highlight(lights, l, p, n, wo, gloss * gloss) * lights.specular[l]
+    if lights.specular[l] > 0.0:
+        block.lamp_specular[lane] = highlight(lights, l, p, n, wo, gloss * gloss) * lights.specular[l]
     if lights.even[l] == 0:
         _shape(block, lane, lights, l)
     # A clear coat has a highlight of its own, where the rest of the surface may have none.
-    return block.lamp_diffuse[lane] + block.lamp_specular[lane] > 0.0 or block.coat[lane] > 0.0
+    coated = block.coat[lane] > 0.0 and lights.specular[l] > 0.0
+    return block.lamp_diffuse[lane] + block.lamp_specular[lane] > 0.0 or coated
 
 
 @inlined
@@ -373,7 +375,7 @@ def add_light(block: Block, lane: int, lights: LightTable, l: int) -> None:  # n
     f = row(block.fresnel, lane)
     coat = block.coat[lane]
     coat_light = 0.0
-    if coat > 0.0:
+    if coat > 0.0 and lights.specular[l] > 0.0:
         gloss = block.coat_roughness[lane]
         fc = coat * (_COAT_F0 + (1.0 - _COAT_F0) * (1.0 - min(1.0, max(0.0, dot(n, wo)))) ** 5)
         coat_light = fc * highlight(lights, l, p, n, wo, gloss * gloss) * lights.specular[l]

@@ -126,6 +126,8 @@ class World(NamedTuple):
     """Some material is a cut-out, so that hits must be looked at."""
     lit: bool
     """Some light or the sky shines; otherwise all light is emitted, and falls on nothing."""
+    gleams: bool
+    """Some light has highlights."""
 
 
 def world_of(
@@ -140,7 +142,8 @@ def world_of(
     walked = bool((materials.model != Model.NONE).any())
     glass = GlassShade(np.zeros(len(geometry.thing), np.uint8), walked)
     cutouts = bool(materials.cutout.any())
-    return World(geometry, materials, textures, lights, environment, glass, no_caustics(), cutouts, lit)
+    gleams = bool((lights.specular > 0.0).any())
+    return World(geometry, materials, textures, lights, environment, glass, no_caustics(), cutouts, lit, gleams)
 
 
 def pack_materials(materials: Sequence[Material], slots: dict[str, int], drawn_as: str) -> MaterialTable:
