@@ -66,7 +66,7 @@ class Row:
     ior: float = 1.5
     color: tuple[float, float, float] = (1.0, 1.0, 1.0)
     color_from: str = ""
-    """Output that drives the colour, or ''."""
+    """Output or picture that drives the colour, or ''."""
     distance: float | None = None
     """None where the model fixes it, or nothing is absorbed."""
     thickness: float | None = None
@@ -184,8 +184,9 @@ def _plan(glass: Glass, uses: list[Use], forced: str, unit: float) -> _Plan:
     color, distance = _absorption(glass, model, thickness, unit, more)
     if glass.authored:
         more.append(f"authored already, and kept: {', '.join(sorted(glass.authored))}")
+    driver = glass.color_from or (glass.color_map.told() if glass.color_map else "")
     row = replace(
-        row, model=model.token, color=color, color_from=glass.color_from, distance=distance,
+        row, model=model.token, color=color, color_from=driver, distance=distance,
         thickness=thickness, why=why, notes=tuple(dict.fromkeys((*glass.notes, *notes, *more))),
     )  # fmt: skip
     sized = tuple(use.path for use in uses if use.edit) if model.sized else ()
@@ -237,12 +238,13 @@ def _absorption(
 ) -> tuple[tuple[float, float, float], float | None]:
     """Colour and the distance after which it is left; None where the model fixes it or nothing is absorbed."""
     color = tuple(neat(value) for value in glass.color)
-    clear = color == (1.0, 1.0, 1.0) and not glass.color_from
+    driven = bool(glass.color_from or glass.color_map)
+    clear = color == (1.0, 1.0, 1.0) and not driven
     if model.fixed_thickness:
         own = f"the {model.token} model's {model.fixed_thickness * 1000:g} mm"
         if clear or glass.distance is None:
             return color, None  # type: ignore[return-value]
-        if glass.color_from:
+        if driven:
             notes.append(f"the colour is mapped, so it holds for {own} instead of its own distance")
             return color, None  # type: ignore[return-value]
         # After the way through a wall of fixed thickness, color^(thickness / distance) is left.
@@ -253,7 +255,7 @@ def _absorption(
         return color, None  # type: ignore[return-value]
     if glass.distance is not None:
         return color, neat(glass.distance)  # type: ignore[return-value]
-    distance = thickness if model.sized and thickness else 1.0
+    distance = (thickness if model.sized else None) or glass.thickness or 1.0
     notes.append(f"its colour tints a surface at any depth; here it is left after {distance:g} units")
     return color, distance  # type: ignore[return-value]
 
@@ -261,18 +263,21 @@ def _absorption(
 def _additions(glass: Glass, row: Row, per_prim: dict[str, float]) -> Iterable[Addition]:
     """What is authored on the material, and on single prims that need another thickness."""
     values: dict[str, Any] = {"refraction:model": row.model, "inputs:refraction:ior": row.ior}
-    connections: dict[str, str] = {}
     if row.color != (1.0, 1.0, 1.0) or row.color_from:
         values["inputs:refraction:transmittanceColor"] = row.color
-        if row.color_from:
-            connections["inputs:refraction:transmittanceColor"] = row.color_from
+    connections = {"inputs:refraction:transmittanceColor": glass.color_from}
+    maps = {"inputs:refraction:transmittanceColor": glass.color_map}
+    if row.thickness is not None:
+        connections["inputs:refraction:thickness"] = glass.thickness_from
+        maps["inputs:refraction:thickness"] = glass.thickness_map
     for name, value in (("absorptionDistance", row.distance), ("thickness", row.thickness)):
         if value is not None:
             values[f"inputs:refraction:{name}"] = value
     if row.abbe > 0.0:
         values["inputs:refraction:abbeNumber"] = row.abbe
     mine = {name: value for name, value in values.items() if name not in glass.authored}
-    wired = {name: source for name, source in connections.items() if name not in glass.authored}
-    yield Addition(glass.edit, True, mine, wired)
+    wired = {name: source for name, source in connections.items() if source and name not in glass.authored}
+    made = {name: what for name, what in maps.items() if what is not None and name not in glass.authored}
+    yield Addition(glass.edit, True, mine, wired, made)
     for path, thickness in per_prim.items():
         yield Addition(path, False, {"primvars:refraction:thickness": thickness}, {})

@@ -335,4 +335,6 @@ def _addition(glass: Glass, candidate: Candidate, scene: Scene, drawn_as: Scene)
     moved = bool(before.model.fixed_thickness) or not glass.applied
     if moved and not candidate.model.fixed_thickness and tint != _WHITE:
         values["inputs:refraction:absorptionDistance"] = neat(row.absorption_distance / unit)
-    return Addition(glass.edit, True, values, connections)
+    new_map = glass.color_map is not None and not glass.applied
+    maps = {"inputs:refraction:transmittanceColor": glass.color_map} if new_map and glass.color_map else {}
+    return Addition(glass.edit, True, values, connections, maps)

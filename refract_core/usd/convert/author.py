@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from pxr import Gf, Sdf, Usd, UsdGeom
@@ -15,6 +16,7 @@ from ..layers.write import RECORD, apply_api, overlay
 from ..materials.read import API
 from ..ours import recognised
 from ..stage import open_stage, stage_unit, time_range
+from .networks import Mapped, author
 
 MADE = "convert"
 """What `write` records of who made a layer."""
@@ -42,6 +44,8 @@ class Addition(NamedTuple):
     """Attribute -> value: a token, a float or a colour, by the type that the schema gives it."""
     connections: dict[str, str]
     """Attribute -> path of the output that drives it."""
+    maps: Mapping[str, Mapped] = MappingProxyType({})
+    """Attribute -> what drives it, where no output of the stage can be connected to: nodes are written for it."""
 
 
 def begin(path: str, *, flatten: bool) -> Work:
@@ -101,7 +105,11 @@ def add(layer: Sdf.Layer, additions: Iterable[Addition]) -> None:
                 apply_api(spec, API)
             for name, value in addition.values.items():
                 _attribute(spec, name).default = Gf.Vec3f(*value) if isinstance(value, tuple) else value
-            for name, source in addition.connections.items():
+            driven = dict(addition.connections)
+            for name, what in addition.maps.items():
+                label, color = name.rpartition(":")[2], _TYPES[name] == Sdf.ValueTypeNames.Color3f
+                driven[name] = author(layer, addition.path, label, what, color=color)
+            for name, source in driven.items():
                 _attribute(spec, name).connectionPathList.explicitItems = [Sdf.Path(source)]
 
 

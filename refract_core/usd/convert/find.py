@@ -9,9 +9,10 @@ from pxr import Sdf, Usd, UsdShade
 
 from ...scene import Notice, Param, Source, Texture
 from ..materials.read import has_api, read_surface, vendor_surfaces
-from ..materials.sources import Context, is_constant, producer, scalar
-from ..materials.surfaces import Surface
+from ..materials.sources import Context, is_constant, read_source, scalar
+from ..materials.surfaces import Surface, highest
 from ..materials.vendors import vendor_id
+from .networks import Mapped, mapped, writable
 
 _SWITCHES = {
     "UsdPreviewSurface": "opacity",
@@ -21,6 +22,7 @@ _SWITCHES = {
     "ND_gltf_pbr_surfaceshader": "transmission",
 }
 """The input without which a shader is opaque."""
+_DEEPEST = 32
 _COLORS = ("transmission_color", "attenuation_color", "base_color", "glass_color", "refractionColor")
 
 
@@ -43,11 +45,16 @@ class Glass:
     """The constant, or the fallback of what drives it."""
     color_from: str
     """Path of the output that drives the colour, or ''."""
+    color_map: Mapped | None
+    """What drives it, where no output can be connected to."""
     distance: float | None
     """None where the colour tints at any depth."""
     abbe: float
     thickness: float
-    """As authored on the shader (glTF); 0 where it says none."""
+    """As authored on the shader (glTF), or the largest that its map gives; 0 where it says none."""
+    thickness_from: str
+    """Path of the output that drives the thickness, or ''."""
+    thickness_map: Mapped | None
     authored: frozenset[str]
     """Names of our own attributes that are authored although the schema is not applied."""
     notes: tuple[str, ...]
@@ -93,8 +100,8 @@ def _read(prim: Usd.Prim, time: Usd.TimeCode, unit: float, textures: dict[str, T
         return None
     ior, ior_note = _constant(surface, Param.IOR, 1.5)
     color = surface.inputs.get(Param.TRANSMITTANCE, Source(value=(1.0, 1.0, 1.0, 1.0)))
-    driver, color_note = ("", "") if is_constant(color) else _driver(material, shader, context)
-    thickness, thickness_note = _thickness(context, shader)
+    driver, color_map, color_note = _color(context, material, shader, color)
+    thickness, thickness_from, thickness_map, thickness_note = _thickness(context, material, shader)
     notes = [note.text for note in notices] + [ior_note, color_note, thickness_note, *_warnings(prim, surface)]
     distance = surface.absorption_distance
     return Glass(
@@ -107,9 +114,12 @@ def _read(prim: Usd.Prim, time: Usd.TimeCode, unit: float, textures: dict[str, T
         ior=ior,
         color=(color.value[0], color.value[1], color.value[2]),
         color_from=driver,
+        color_map=color_map,
         distance=None if distance is None else distance / unit,
         abbe=max(surface.abbe, 0.0),
         thickness=thickness,
+        thickness_from=thickness_from,
+        thickness_map=thickness_map,
         authored=frozenset(name for name in prim.GetAuthoredPropertyNames() if "refraction:" in name),
         notes=tuple(note for note in notes if note),
     )
@@ -139,28 +149,52 @@ def _constant(surface: Surface, param: Param, default: float) -> tuple[float, st
     return value, "" if is_constant(source) else text
 
 
-def _driver(material: UsdShade.Material, shader: UsdShade.Shader | None, context: Context) -> tuple[str, str]:
-    """Output inside the material that drives the colour, and a note where it cannot be connected from outside."""
-    for name in _COLORS if shader is not None else ():
-        attribute = producer(context, shader.GetInput(name)) if shader is not None else None
-        if attribute is None or not UsdShade.Output.IsOutput(attribute):
-            continue
-        if attribute.GetPrim().GetParent() == material.GetPrim():
-            return str(attribute.GetPath()), ""
-        return "", f"{name} is driven from inside a node graph, where {material.GetPath().name} cannot reach it"
-    return "", ""
+def _driver(material: UsdShade.Material, port: UsdShade.Input) -> str:
+    """Output right inside the material that drives an input of its shader; '' where there is none."""
+    for _ in range(_DEEPEST):
+        if not port or not port.HasConnectedSource():
+            return ""
+        info = port.GetConnectedSources()[0][0]
+        prim = info.source.GetPrim()
+        if info.sourceType != UsdShade.AttributeType.Input:
+            inside = prim.GetParent() == material.GetPrim()
+            return str(info.source.GetOutput(info.sourceName).GetAttr().GetPath()) if inside else ""
+        port = info.source.GetInput(info.sourceName)  # of a node graph, or of the material
+    return ""
 
 
-def _thickness(context: Context, shader: UsdShade.Shader | None) -> tuple[float, str]:
-    """Thickness of a glTF PBR shader, which is the only one that has it."""
+def _color(
+    context: Context, material: UsdShade.Material, shader: UsdShade.Shader | None, color: Source
+) -> tuple[str, Mapped | None, str]:
+    """Output that drives the colour, or what to write in its place, and a note where neither can be."""
+    if shader is None or is_constant(color):
+        return "", None, ""
+    for name in _COLORS:
+        port = shader.GetInput(name)
+        driver = _driver(material, port) if port else ""
+        if driver and read_source(context, port, (1.0, 1.0, 1.0)) == color:
+            return driver, None, ""
+    if writable(color):
+        return "", mapped(color, context.textures), ""
+    return "", None, "what drives its colour cannot be written for the schema; the fallback is used"
+
+
+def _thickness(
+    context: Context, material: UsdShade.Material, shader: UsdShade.Shader | None
+) -> tuple[float, str, Mapped | None, str]:
+    """Thickness of a glTF PBR shader, which is the only one that has it: its number, and what drives it."""
     port = shader.GetInput("thickness") if shader is not None and "gltf_pbr" in str(shader.GetShaderId()) else None
-    attribute = producer(context, port) if port else None
-    if attribute is None:
-        return 0.0, ""
-    if UsdShade.Output.IsOutput(attribute):
-        return 0.0, "thickness is mapped; the geometry's is used. Connect inputs:refraction:thickness to keep the map"
-    value = attribute.Get(context.time)
-    return (float(value), "") if isinstance(value, float) and value > 0.0 else (0.0, "")
+    if not port:
+        return 0.0, "", None, ""
+    source = scalar(read_source(context, port, 0.0))
+    if is_constant(source):
+        return max(source.value[0], 0.0), "", None, ""
+    most = highest(source, context.textures)
+    if driver := _driver(material, port):
+        return most, driver, None, ""
+    if writable(source):
+        return most, "", mapped(source, context.textures), ""
+    return most, "", None, "what drives its thickness cannot be written for the schema; one number is used"
 
 
 def _warnings(prim: Usd.Prim, surface: Surface) -> Iterable[str]:

@@ -56,17 +56,18 @@ def _build(path: str, gltf: Gltf, pictures: str) -> tuple[Work, list[Glass], dic
     scope = UsdGeom.Scope.Define(stage, root.GetPath().AppendChild("Looks"))
     files = [os.path.join(pictures, f"{n}{kind}") if kind else "" for n, (kind, _) in enumerate(gltf.images)]
     names = _names([material.name for material in gltf.materials])
+    painted = _painted(gltf)
     materials = [
-        _material(stage, scope.GetPath().AppendChild(name), material, files)
-        for name, material in zip(names, gltf.materials, strict=True)
+        _material(stage, scope.GetPath().AppendChild(name), material, files, painted=number in painted)
+        for number, (name, material) in enumerate(zip(names, gltf.materials, strict=True))
     ]
     scales: dict[int, list[float]] = defaultdict(list)
     for name, number in zip(_names([gltf.nodes[n].name for n in gltf.roots], {"Looks"}), gltf.roots, strict=True):
         _node(stage, root.GetPath().AppendChild(name), number, gltf, materials, np.eye(4), scales, 0)
     glass = [
-        _glass(material, str(made.GetPath()), scales[number])
+        _glass(material, made, files, scales[number])
         for number, (material, made) in enumerate(zip(gltf.materials, materials, strict=True))
-        if material.transmission > 0.0
+        if material.transmission > 0.0 and (material.metallic < 1.0 or _usable(material, "metallic_roughness", files))
     ]
     content = {file: image for file, (_, image) in zip(files, gltf.images, strict=True) if file}
     return Work(stage, layer, Usd.TimeCode(0.0), 1.0, gltf.notices), glass, content
@@ -140,7 +141,9 @@ def _mesh(
         primvar.Set(Vt.Vec2fArray.FromNumpy(flipped))
     if primitive.colors is not None:
         primvar = primvars.CreatePrimvar("displayColor", _TYPES.Color3fArray, UsdGeom.Tokens.vertex)
-        primvar.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(primitive.colors)))
+        # The primvar is read alone, and glTF multiplies both: the factor goes into it.
+        factor = gltf.materials[primitive.material].base[:3] if primitive.material >= 0 else (1.0, 1.0, 1.0)
+        primvar.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(primitive.colors * np.array(factor, np.float32))))
     if primitive.material >= 0:
         mesh.CreateDoubleSidedAttr(gltf.materials[primitive.material].double_sided)
         UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(materials[primitive.material])
@@ -153,8 +156,24 @@ def _st(uv_set: int) -> str:
 # --- materials ------------------------------------------------------------------------------------------------------
 
 
-def _material(stage: Usd.Stage, path: Sdf.Path, material: GltfMaterial, files: list[str]) -> UsdShade.Material:
-    """UsdPreviewSurface; roughness, metallic and occlusion from the channels that glTF packs them in."""
+def _painted(gltf: Gltf) -> set[int]:
+    """Materials whose base colour is that of the vertices: all they are on has one, and no picture is in the way."""
+    found: dict[int, bool] = {}
+    for _, primitives in gltf.meshes:
+        for one in primitives:
+            found[one.material] = found.get(one.material, True) and one.colors is not None
+    return {number for number, all_of_it in found.items() if all_of_it and number >= 0
+            and "base" not in gltf.materials[number].pictures}  # fmt: skip
+
+
+def _material(
+    stage: Usd.Stage, path: Sdf.Path, material: GltfMaterial, files: list[str], *, painted: bool
+) -> UsdShade.Material:
+    """UsdPreviewSurface; roughness, metallic and occlusion from the channels that glTF packs them in.
+
+    Args:
+        painted: the base colour is that of the vertices.
+    """
     made = UsdShade.Material.Define(stage, path)
     shader = UsdShade.Shader.Define(stage, path.AppendChild("Surface"))
     shader.CreateIdAttr("UsdPreviewSurface")
@@ -171,7 +190,15 @@ def _material(stage: Usd.Stage, path: Sdf.Path, material: GltfMaterial, files: l
         texture = _texture(made, name, picture, files[picture.image], scale, color=kind == _TYPES.Color3f)
         port.ConnectToSource(texture.ConnectableAPI(), channel)
 
-    drive("diffuseColor", _TYPES.Color3f, "base", "rgb", material.base)
+    if painted:
+        reader = UsdShade.Shader.Define(stage, path.AppendChild("diffuseColor_primvar"))
+        reader.CreateIdAttr("UsdPrimvarReader_float3")
+        reader.CreateInput("varname", _TYPES.String).Set("displayColor")
+        reader.CreateInput("fallback", _TYPES.Float3).Set(Gf.Vec3f(*material.base[:3]))
+        colors = reader.CreateOutput("result", _TYPES.Float3)
+        shader.CreateInput("diffuseColor", _TYPES.Color3f).ConnectToSource(colors)
+    else:
+        drive("diffuseColor", _TYPES.Color3f, "base", "rgb", material.base)
     drive("emissiveColor", _TYPES.Color3f, "emissive", "rgb", material.emissive)
     drive("metallic", _TYPES.Float, "metallic_roughness", "b", (material.metallic,))
     drive("roughness", _TYPES.Float, "metallic_roughness", "g", (material.roughness,))
@@ -200,15 +227,19 @@ def _normal(made: UsdShade.Material, shader: UsdShade.Shader, material: GltfMate
 def _opacity(
     made: UsdShade.Material, shader: UsdShade.Shader, material: GltfMaterial, files: list[str], drive: object
 ) -> None:
-    """1 - transmission for glass; else what glTF's alpha mode says."""
+    """1 - transmission for glass, for metal lets no light through; else what glTF's alpha mode says."""
     if material.transmission > 0.0:
-        port, t = shader.CreateInput("opacity", _TYPES.Float), material.transmission
-        picture = material.pictures.get("transmission")
-        if picture is None or picture.image < 0 or not files[picture.image]:
-            port.Set(1.0 - t)
-            return
-        texture = _texture(made, "opacity", picture, files[picture.image], (-t,) * 4, (1.0,) * 4)
-        port.ConnectToSource(texture.ConnectableAPI(), "r")
+        port, t, m = shader.CreateInput("opacity", _TYPES.Float), material.transmission, material.metallic
+        picture, metal = (_usable(material, name, files) for name in ("transmission", "metallic_roughness"))
+        if picture is not None:
+            t *= 1.0 - m if metal is None else 1.0  # two pictures cannot be multiplied; the metal's is left
+            texture = _texture(made, "opacity", picture, files[picture.image], (-t,) * 4, (1.0,) * 4)
+            port.ConnectToSource(texture.ConnectableAPI(), "r")
+        elif metal is not None and m > 0.0:
+            texture = _texture(made, "opacity", metal, files[metal.image], (t * m,) * 4, (1.0 - t,) * 4)
+            port.ConnectToSource(texture.ConnectableAPI(), "b")
+        else:
+            port.Set(1.0 - t * (1.0 - m))
     elif material.alpha_mode != "OPAQUE":
         assert callable(drive)
         drive("opacity", _TYPES.Float, "base", "a", (material.base[3],))
@@ -216,6 +247,11 @@ def _opacity(
             shader.CreateInput("opacityThreshold", _TYPES.Float).Set(max(material.alpha_cutoff, 1.0e-6))
         else:
             shader.CreateInput("opacityMode", _TYPES.Token).Set("presence")
+
+
+def _usable(material: GltfMaterial, name: str, files: list[str]) -> Picture | None:
+    picture = material.pictures.get(name)
+    return picture if picture is not None and picture.image >= 0 and files[picture.image] else None
 
 
 def _texture(
@@ -272,29 +308,52 @@ def _moved(stage: Usd.Stage, path: Sdf.Path, picture: Picture, st: UsdShade.Outp
 # --- glass ----------------------------------------------------------------------------------------------------------
 
 
-def _glass(material: GltfMaterial, path: str, scales: list[float]) -> Glass:
-    """What the KHR extensions say, as the schema has it: no volume is a thin wall that the base colour tints."""
+def _glass(material: GltfMaterial, made: UsdShade.Material, files: list[str], scales: list[float]) -> Glass:
+    """What the KHR extensions say, as the schema has it: no volume is a thin wall that the base colour tints.
+
+    Where a volume absorbs, and its base colour tints too, both are one colour that is left after one thickness.
+    """
     notes = []
+    path = made.GetPath()
     thin = material.thickness <= 0.0
-    color, distance = material.base[:3], None
-    if not thin and material.attenuation_distance > 0.0:
+    # thicknessFactor is in mesh space: one number only where all meshes are scaled alike.
+    alike = bool(scales) and max(scales) - min(scales) <= 0.05 * max(scales)
+    thickness = material.thickness * scales[0] if alike else 0.0
+    base, distance = material.base[:3], None
+    node = UsdShade.Shader(made.GetPrim().GetChild("Surface")).GetInput("diffuseColor").GetConnectedSources()[0]
+    driver = node[0].source.GetOutput(node[0].sourceName).GetAttr() if node else None
+    color, color_from = base, str(driver.GetPath()) if driver else ""
+    if not thin and material.attenuation_distance > 0.0 and material.attenuation_color != (1.0, 1.0, 1.0):
         color, distance = material.attenuation_color, material.attenuation_distance
-        if material.base[:3] != (1.0, 1.0, 1.0) or "base" in material.pictures:
-            notes.append("the base colour tints the surface too, which the schema has no place for")
-    elif "base" in material.pictures:
-        notes.append("the base colour's picture tints the surface; its factor alone is used")
+        tinted = driver or base != (1.0, 1.0, 1.0)
+        picture = _usable(material, "base", files)
+        if tinted and thickness > 0.0 and (picture is not None or not driver):
+            r, g, b = (factor * left ** (thickness / distance) for factor, left in zip(base, color, strict=True))
+            color, distance = (r, g, b), thickness
+            if picture is not None:
+                one = _texture(made, "transmittance", picture, files[picture.image], (r, g, b, 1.0), color=True)
+                color_from = f"{one.GetPath()}.outputs:rgb"
+        else:
+            color_from = ""
+            if tinted:
+                notes.append("the base colour tints the surface too, which the schema has no place for")
     ior = material.ior
     if ior < 1.0:
         notes.append(f"ior is {ior:g}, glTF's special mode; 1.5 is used")
         ior = 1.5
-    # thicknessFactor is in mesh space: one number only where all meshes are scaled alike.
-    alike = bool(scales) and max(scales) - min(scales) <= 0.05 * max(scales)
-    thickness = material.thickness * scales[0] if alike else 0.0
-    if "thickness" in material.pictures:
-        notes.append("the thickness picture is not carried over; `refract bake thickness` measures the geometry")
+    if "transmission" in material.pictures and "metallic_roughness" in material.pictures and material.metallic > 0.0:
+        notes.append("transmission and metal are both mapped; the metal's picture is left out of the opacity")
+    thickness_from = ""
+    if (depth := _usable(material, "thickness", files)) is not None:
+        if thickness > 0.0:
+            one = _texture(made, "thickness", depth, files[depth.image], (thickness,) * 4)
+            thickness_from = f"{one.GetPath()}.outputs:g"
+        else:
+            notes.append("its meshes are scaled differently, so the thickness picture is left out")
     return Glass(
-        path=path, edit=path, shader="KHR_materials_transmission", applied=False, thin=thin, surface=Surface(),
-        ior=ior, color=color, color_from="", distance=distance,
+        path=str(path), edit=str(path), shader="KHR_materials_transmission", applied=False, thin=thin,
+        surface=Surface(), ior=ior, color=color, color_from=color_from, color_map=None, distance=distance,
         abbe=20.0 / material.dispersion if material.dispersion > 0.0 else 0.0,
-        thickness=thickness, authored=frozenset(), notes=tuple(notes),
+        thickness=thickness, thickness_from=thickness_from, thickness_map=None, authored=frozenset(),
+        notes=tuple(notes),
     )  # fmt: skip

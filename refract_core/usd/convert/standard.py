@@ -6,7 +6,7 @@ existing one of the same kind leaves open is filled in.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 from pxr import Gf, Sdf, Usd, UsdShade
@@ -14,10 +14,11 @@ from pxr import Gf, Sdf, Usd, UsdShade
 from ...models import Behind, Model
 from ...scene import Material, Notice, Param, Source, Texture
 from ..materials.read import read_material
-from ..materials.sources import is_constant
+from ..materials.sources import is_constant, scaled
 from ..stage import stage_unit, time_range
 from ..values import neat
 from .find import editable
+from .networks import author, author_normal, connect, mapped, writable
 
 
 class _Target(NamedTuple):
@@ -62,11 +63,14 @@ def write_surfaces(layer: Sdf.Layer, target: str, paths: Iterable[str]) -> dict[
         record = read_material(
             material, time, metres_per_unit=unit, closed=True, textures=textures, notices=notices
         )  # fmt: skip
-        told[path] = tuple(_write(material, record, _TARGETS[target], unit))
+        told[path] = tuple(_write(layer, material, record, textures, _TARGETS[target], unit))
     return told
 
 
-def _write(material: UsdShade.Material, record: Material, target: _Target, unit: float) -> Iterable[str]:
+def _write(
+    layer: Sdf.Layer, material: UsdShade.Material, record: Material, textures: dict[str, Texture], target: _Target,
+    unit: float,
+) -> Iterable[str]:  # fmt: skip
     """One material's surface; tells what was done, or why nothing."""
     where = f"outputs:{target.context + ':' if target.context else ''}surface"
     place = editable(material.GetPrim())
@@ -76,18 +80,34 @@ def _write(material: UsdShade.Material, record: Material, target: _Target, unit:
         )
         return
     essential, rest = _MAKERS[target.identifier](record, unit)
+    drivers = {name: source for name, source in _driven(record, target, unit).items() if not is_constant(source)}
+    for name in drivers.keys() - essential.keys() - rest.keys():
+        rest[name] = (0.0, 0.0, 0.0) if name in _THREE else 0.0
+    if lost := sorted(name for name, source in drivers.items() if not writable(source)):
+        yield f"no {target.identifier} is written: what drives {', '.join(lost)} cannot be written for it"
+        return
+
+    def drive(shader: UsdShade.Shader, name: str, kind: Sdf.ValueTypeName) -> None:
+        what, home = mapped(drivers[name], textures), str(place)
+        if name in _NORMALS and target.context:
+            output = author_normal(layer, home, name, what)
+        else:
+            output = author(layer, home, name, what, color=name in _THREE, mtlx=bool(target.context))
+        connect(layer, str(shader.GetPath()), name, kind, output)
+
     existing, taken = _existing(material, target)
     if existing is not None:
-        yield from _fill(existing, essential, target)
+        yield from _fill(existing, essential, target, drivers, drive)
     elif taken:
         yield f"no {target.identifier} is written: {where} is {taken} already"
-    elif mapped := _mapped(record, target):
-        yield f"no {target.identifier} is written: {', '.join(mapped)} is mapped, which is not carried over"
     else:
         home = UsdShade.Material(material.GetPrim().GetStage().GetPrimAtPath(place))
         shader = _make(home, target)
         for name, value in {**rest, **essential}.items():
-            shader.CreateInput(name, _KINDS[type(value)]).Set(_value(value))
+            if name in drivers:
+                drive(shader, name, _kind(name, value))
+            else:
+                shader.CreateInput(name, _kind(name, value)).Set(_value(value))
         yield f"{target.identifier} is written on {where}"
 
 
@@ -114,7 +134,14 @@ def _make(material: UsdShade.Material, target: _Target) -> UsdShade.Shader:
     return shader
 
 
-def _fill(shader: UsdShade.Shader, essential: _Inputs, target: _Target) -> Iterable[str]:
+def _kind(name: str, value: Any) -> Sdf.ValueTypeName:
+    return Sdf.ValueTypeNames.Normal3f if name in _NORMALS else _KINDS[type(value)]
+
+
+def _fill(
+    shader: UsdShade.Shader, essential: _Inputs, target: _Target, drivers: dict[str, Source],
+    drive: Callable[[UsdShade.Shader, str, Sdf.ValueTypeName], None],
+) -> Iterable[str]:  # fmt: skip
     """Author what is left open; name what is authored otherwise and stays."""
     place = editable(shader.GetPrim())
     if place is None:
@@ -126,7 +153,10 @@ def _fill(shader: UsdShade.Shader, essential: _Inputs, target: _Target) -> Itera
         made = port.GetValueProducingAttributes() if port else []
         if not made:
             at = UsdShade.Shader(shader.GetPrim().GetStage().GetPrimAtPath(place))
-            at.CreateInput(name, _KINDS[type(value)]).Set(_value(value))
+            if name in drivers:
+                drive(at, name, _kind(name, value))
+            else:
+                at.CreateInput(name, _kind(name, value)).Set(_value(value))
             written.append(name)
         elif UsdShade.Output.IsOutput(made[0]) or not _same(made[0].Get(), value):
             stays.append(name)
@@ -151,15 +181,55 @@ def _value(value: Any) -> Any:
 # --- inputs ---------------------------------------------------------------------------------------------------------
 
 
-def _mapped(record: Material, target: _Target) -> list[str]:
-    """Names of the inputs that a picture or primvar drives and that show in this kind of surface."""
-    shown = {Param.IOR, Param.ROUGHNESS, Param.OPACITY, Param.NORMAL, Param.EMISSIVE, Param.METALLIC}
-    shown |= {Param.CLEARCOAT, Param.CLEARCOAT_ROUGHNESS}
-    if target.context:
-        shown.add(Param.TRANSMITTANCE)
-    if record.inputs[Param.OPACITY].value[0] > 0.0 or not is_constant(record.inputs[Param.OPACITY]):
-        shown |= {Param.DIFFUSE, Param.OCCLUSION}
-    return [param.name.lower() for param in sorted(shown) if not is_constant(record.inputs[param])]
+_NORMALS = ("normal", "geometry_normal")
+_THREE = (
+    "diffuseColor", "emissiveColor", "base_color", "emission_color", "emissive", "transmission_color",
+    "attenuation_color", *_NORMALS,
+)  # fmt: skip
+"""Inputs that take three numbers."""
+_NAMES: dict[str, dict[Param, str]] = {
+    "UsdPreviewSurface": {
+        Param.DIFFUSE: "diffuseColor", Param.EMISSIVE: "emissiveColor", Param.METALLIC: "metallic",
+        Param.ROUGHNESS: "roughness", Param.CLEARCOAT: "clearcoat", Param.CLEARCOAT_ROUGHNESS: "clearcoatRoughness",
+        Param.OPACITY: "opacity", Param.IOR: "ior", Param.NORMAL: "normal", Param.OCCLUSION: "occlusion",
+    },
+    "ND_open_pbr_surface_surfaceshader": {
+        Param.DIFFUSE: "base_color", Param.EMISSIVE: "emission_color", Param.METALLIC: "base_metalness",
+        Param.ROUGHNESS: "specular_roughness", Param.CLEARCOAT: "coat_weight",
+        Param.CLEARCOAT_ROUGHNESS: "coat_roughness", Param.OPACITY: "transmission_weight",
+        Param.IOR: "specular_ior", Param.NORMAL: "geometry_normal", Param.TRANSMITTANCE: "transmission_color",
+    },
+    "ND_gltf_pbr_surfaceshader": {
+        Param.DIFFUSE: "base_color", Param.EMISSIVE: "emissive", Param.METALLIC: "metallic",
+        Param.ROUGHNESS: "roughness", Param.CLEARCOAT: "clearcoat",
+        Param.CLEARCOAT_ROUGHNESS: "clearcoat_roughness", Param.OPACITY: "transmission", Param.IOR: "ior",
+        Param.NORMAL: "normal", Param.OCCLUSION: "occlusion", Param.TRANSMITTANCE: "attenuation_color",
+        Param.THICKNESS: "thickness",
+    },
+}  # fmt: skip
+"""What each shader calls the inputs that a picture may drive."""
+
+
+def _driven(record: Material, target: _Target, unit: float) -> dict[str, Source]:
+    """What drives each input of the shader. The surface's own colour is left where nothing of it shows."""
+    opacity = record.inputs[Param.OPACITY]
+    clear = is_constant(opacity) and opacity.value[0] <= 0.0
+    thin = record.model.behind is Behind.SHEET
+    found = {}
+    for param, name in _NAMES[target.identifier].items():
+        source = record.inputs[param]
+        if param in (Param.DIFFUSE, Param.METALLIC, Param.OCCLUSION) and clear:
+            continue
+        if param is Param.OPACITY and target.context:
+            source = scaled(source, -1.0, 1.0)
+        if param is Param.THICKNESS:
+            source = scaled(source, 1.0 / unit)
+            if thin or source.texture < 0:  # a typed number yields to a primvar that no standard surface knows
+                continue
+        found[name] = source
+    if thin and "attenuation_color" in found:  # a wall without thickness has no volume; its colour is the base colour
+        found["base_color"] = found.pop("attenuation_color")
+    return found
 
 
 def _one(record: Material, param: Param) -> float:
@@ -217,7 +287,7 @@ def _open_pbr(record: Material, unit: float) -> tuple[_Inputs, _Inputs]:
         "specular_roughness": _one(record, Param.ROUGHNESS),
     }
     rest |= _body(record, "emission_color", "coat_weight", "coat_roughness")
-    if "emission_color" in rest:
+    if "emission_color" in rest or not is_constant(record.inputs[Param.EMISSIVE]):
         rest["emission_luminance"] = 1.0
     return glass, rest
 
@@ -232,7 +302,7 @@ def _gltf(record: Material, unit: float) -> tuple[_Inputs, _Inputs]:
         # A wall without thickness has no volume; its colour is the base colour.
         "thickness": 0.0 if thin else neat(record.inputs[Param.THICKNESS].value[0] / unit),
     }
-    if not thin and tint != (1.0, 1.0, 1.0):
+    if not thin and (tint != (1.0, 1.0, 1.0) or not is_constant(record.inputs[Param.TRANSMITTANCE])):
         glass |= {"attenuation_color": tint, "attenuation_distance": neat(record.absorption_distance / unit)}
     if record.abbe > 0.0:
         glass["dispersion"] = neat(20.0 / record.abbe)

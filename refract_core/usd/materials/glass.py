@@ -185,6 +185,16 @@ def _see_through(inputs: dict[Param, Source], transmission: Source) -> bool:
     return not opaque and not (is_constant(metal) and metal.value[0] >= 1.0)
 
 
+def _remaining(context: Context, naming: Naming, transmission: Source, metal: Source) -> Source:
+    """Opacity: 1 - transmission * (1 - metal), where at least one of them is a constant."""
+    if is_constant(metal):
+        return scaled(transmission, metal.value[0] - 1.0, 1.0)
+    if is_constant(transmission):
+        return scaled(metal, transmission.value[0], 1.0 - transmission.value[0])
+    note(context, f"{naming.transmission[0]} and {naming.metallic[0]} are both mapped; the metal transmits too")
+    return scaled(transmission, -1.0, 1.0)
+
+
 def _weakened_ior(ior: Source, weight: float) -> Source:
     """The ior whose normal reflectance is `weight` times that of `ior` (OpenPBR 1.1, specular weight)."""
     if not is_constant(ior) or weight == 1.0:
@@ -201,11 +211,35 @@ def _volume(context: Context, shader: UsdShade.Shader, naming: Naming, unit: flo
         f"inputs:{naming.transmission_color[0]}",
     )  # fmt: skip
     depth = _weight(context, shader, naming.transmission_depth) * unit
-    if depth > 0.0:
+    if naming is GLTF_PBR:
+        return _gltf_volume(context, shader, color, depth, unit)
+    return color, depth if depth > 0.0 else None
+
+
+def _gltf_volume(
+    context: Context, shader: UsdShade.Shader, color: Source, depth: float, unit: float
+) -> tuple[Source, float | None]:
+    """The volume's colour and the base colour, which tints too: one colour, left after one thickness.
+
+    Args:
+        color: of the volume.
+        depth: after which it is left [m]; 0 is infinite.
+        unit: metres per scene unit.
+    """
+    white = constant(_WHITE)
+    base = clamped(context, Param.TRANSMITTANCE, _source(context, shader, GLTF_PBR.base_color), "inputs:base_color")
+    thickness = scalar(read_source(context, shader.GetInput("thickness"), 0.0))
+    through = thickness.value[0] * unit if is_constant(thickness) else 0.0
+    if depth <= 0.0 or color == white:  # only the base colour tints
+        return base, through if through > 0.0 and base != white else None
+    if base == white:
         return color, depth
-    if naming is GLTF_PBR:  # infinite attenuation distance: only the base colour tints
-        color = clamped(context, Param.TRANSMITTANCE, _source(context, shader, naming.base_color), "inputs:base_color")
-    return color, None
+    if through > 0.0 and is_constant(color):
+        r, g, b = (left ** (through / depth) for left in color.value[:3])
+        return scaled(base, (r, g, b, 1.0)), through
+    note(context, "base_color tints the surface of a volume too, and is left out: that needs a thickness, and one "
+         "colour for all of the volume")  # fmt: skip
+    return color, depth
 
 
 def _note_ignored(context: Context, shader: UsdShade.Shader, naming: Naming) -> None:
@@ -245,9 +279,7 @@ def _read(context: Context, shader: UsdShade.Shader, naming: Naming, unit: float
         if presence or threshold > 0.0:
             note(context, f"inputs:{naming.opacity[0]} is ignored, because the material transmits light")
         presence, threshold = False, 0.0
-        metal = inputs[Param.METALLIC]
-        weight = 1.0 - metal.value[0] if is_constant(metal) else 1.0
-        inputs[Param.OPACITY] = scaled(scaled(transmission, -weight), 1.0, 1.0)
+        inputs[Param.OPACITY] = _remaining(context, naming, transmission, scalar(inputs[Param.METALLIC]))
         inputs[Param.TRANSMITTANCE], distance = _volume(context, shader, naming, unit)
     else:
         inputs[Param.OPACITY] = coverage

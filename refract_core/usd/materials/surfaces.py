@@ -100,12 +100,24 @@ def lowest(source: Source, textures: dict[str, Texture]) -> float:
         return -math.inf
     if source.texture < 0:
         return source.value[0]
+    return min(_ends(source, textures))
+
+
+def _ends(source: Source, textures: dict[str, Texture]) -> list[float]:
+    """What a scalar picture's smallest and largest texel give."""
     channel = Channel.R if source.channel is Channel.RGB else source.channel
     texture = list(textures.values())[source.texture]
     plane = texture.pixels[..., channel]
     full = 255.0 if texture.pixels.dtype.kind == "u" else 1.0
-    ends = [float(end) / full * source.scale[channel] + source.bias[channel] for end in (plane.min(), plane.max())]
-    return min(ends)
+    return [float(end) / full * source.scale[channel] + source.bias[channel] for end in (plane.min(), plane.max())]
+
+
+def highest(source: Source, textures: dict[str, Texture]) -> float:
+    """Largest value a scalar source may take, of a primvar its fallback; 0 where that is not above 0."""
+    if source.texture < 0:
+        return max(source.value[0], 0.0)
+    ends = _ends(source, textures)
+    return max(*ends, 0.0)
 
 
 def read_preview_surface(context: Context, shader: UsdShade.Shader) -> Surface:

@@ -34,6 +34,14 @@ def texture_key(path: str, color_space: str) -> str:
     return path if color_space == "auto" else f"{path} ({color_space})"
 
 
+def of_key(key: str) -> tuple[str, str]:
+    """Path and colour space of a texture by its name: what `texture_key` was given."""
+    for space in COLOR_SPACES:
+        if key.endswith(f" ({space})"):
+            return key.removesuffix(f" ({space})"), space
+    return key, "auto"
+
+
 def read_texture(path: str, color_space: str) -> Texture:
     """Decode one image file.
 
