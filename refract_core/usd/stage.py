@@ -36,6 +36,8 @@ Keep = Callable[[list[Placement], Tables], list[Placement]]
 
 FALLBACK_METRES_PER_UNIT = 0.01
 _WARNINGS = 20
+_KINDS = ("MaterialX ", "MDL ")
+"""How notices begin that are about a kind of node."""
 _VARIANT = re.compile(r"(?P<prim>(?:/\w+)*)\{(?P<set>[^{}=]{1,200})=(?P<name>[^{}=]{1,200})\}")
 
 
@@ -157,7 +159,22 @@ def scene_from_stage(
             raise StageError(f"{stage.GetRootLayer().identifier}: USD cannot read it: {reason}") from error
     warnings = dict.fromkeys(" ".join(text.split()) for text in heard)
     notices.extend(Notice(scene.name, f"USD says: {text}") for text in list(warnings)[:_WARNINGS])
-    return replace(scene, notices=tuple(dict.fromkeys(notices)))
+    return replace(scene, notices=tuple(_grouped(dict.fromkeys(notices))))
+
+
+def _grouped(notices: dict[Notice, None]) -> list[Notice]:
+    """What is said of many nodes of one kind, said once."""
+    paths: dict[str, list[str]] = {}
+    for notice in notices:
+        if notice.text.startswith(_KINDS):
+            paths.setdefault(notice.text, []).append(notice.path)
+    found = []
+    for notice in notices:
+        where = paths.get(notice.text, [notice.path])
+        if where[0] == notice.path:
+            text = f"{notice.text} ({some_of(where)})" if len(where) > 1 else notice.text
+            found.append(Notice(notice.path, text))
+    return found
 
 
 def _composition_notices(stage: Usd.Stage) -> list[Notice]:

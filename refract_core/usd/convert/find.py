@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from pxr import Sdf, Usd, UsdShade
 
 from ...scene import Notice, Param, Source, Texture
+from ..materials.nodes import read_source
 from ..materials.read import has_api, read_surface, vendor_surfaces
-from ..materials.sources import Context, is_constant, read_source, scalar
+from ..materials.sources import Context, is_constant, scalar
 from ..materials.surfaces import Surface, highest
 from ..materials.vendors import vendor_id
 from .networks import Mapped, mapped, writable
@@ -93,7 +94,7 @@ def _read(prim: Usd.Prim, time: Usd.TimeCode, unit: float, textures: dict[str, T
     if not has_api(prim) and not _may_transmit(material):
         return None
     notices: list[Notice] = []
-    context = Context(str(prim.GetPath()), time, textures, notices, [])
+    context = Context.of(str(prim.GetPath()), time, textures, notices)
     surface, shader = read_surface(context, material, unit)
     applied = has_api(prim)
     if not (surface.glass or applied):
@@ -174,8 +175,8 @@ def _color(
         driver = _driver(material, port) if port else ""
         if driver and read_source(context, port, (1.0, 1.0, 1.0)) == color:
             return driver, None, ""
-    if writable(color):
-        return "", mapped(color, context.textures), ""
+    if writable(what := mapped(color, context.textures)):
+        return "", what, ""
     return "", None, "what drives its colour cannot be written for the schema; the fallback is used"
 
 
@@ -192,8 +193,8 @@ def _thickness(
     most = highest(source, context.textures)
     if driver := _driver(material, port):
         return most, driver, None, ""
-    if writable(source):
-        return most, "", mapped(source, context.textures), ""
+    if writable(what := mapped(source, context.textures)):
+        return most, "", what, ""
     return most, "", None, "what drives its thickness cannot be written for the schema; one number is used"
 
 

@@ -10,7 +10,7 @@ from pxr import Gf, Sdf, UsdShade
 
 from ...scene import Channel, Source, Texture
 from ..materials.sources import is_constant, scaled
-from ..materials.textures import of_key
+from ..materials.textures import is_made, of_key
 
 _TYPES = Sdf.ValueTypeNames
 _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
@@ -33,11 +33,13 @@ def mapped(source: Source, textures: dict[str, Texture]) -> Mapped:
     return Mapped(source, list(textures)[source.texture] if source.texture >= 0 else "")
 
 
-def writable(source: Source) -> bool:
-    """A network of standard nodes says the same: a primvar's reader has no scale, a picture's coordinates no shear."""
+def writable(what: Mapped) -> bool:
+    """A network of standard nodes says the same: a primvar's reader has no scale, a picture's coordinates no shear, and
+    a picture lies in a file."""
+    source = what.source
     if source.texture < 0:
         return is_constant(source) or source == replace(source, scale=(1.0,) * 4, bias=(0.0,) * 4)
-    return _moved(source.uv_matrix) is not None
+    return not is_made(what.texture) and _moved(source.uv_matrix) is not None
 
 
 def author(layer: Sdf.Layer, home: str, name: str, what: Mapped, *, color: bool, mtlx: bool = False) -> str:

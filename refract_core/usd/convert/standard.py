@@ -83,7 +83,7 @@ def _write(
     drivers = {name: source for name, source in _driven(record, target, unit).items() if not is_constant(source)}
     for name in drivers.keys() - essential.keys() - rest.keys():
         rest[name] = (0.0, 0.0, 0.0) if name in _THREE else 0.0
-    if lost := sorted(name for name, source in drivers.items() if not writable(source)):
+    if lost := sorted(name for name, source in drivers.items() if not writable(mapped(source, textures))):
         yield f"no {target.identifier} is written: what drives {', '.join(lost)} cannot be written for it"
         return
 

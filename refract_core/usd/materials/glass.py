@@ -9,16 +9,18 @@ from dataclasses import dataclass, replace
 from pxr import UsdShade
 
 from ...scene import Param, Source
+from .folding import mixed, product
+from .nodes import read_source
 from .sources import (
     Context,
     Value,
     constant,
     is_constant,
+    kind_of,
     note,
     producer,
     read_constant,
     read_number,
-    read_source,
     scalar,
     scaled,
 )
@@ -50,6 +52,8 @@ class Naming:
     base_weight: Named = ("", 1.0)
     specular_weight: Named = ("", 1.0)
     occlusion: Named = ("", 1.0)
+    subsurface: Named = ("", 0.0)
+    subsurface_color: Named = ("", _WHITE)
     ignored: tuple[Named, ...] = ()
     """Inputs this renderer has no answer to, with the value that switches each off."""
 
@@ -70,11 +74,12 @@ OPEN_PBR = Naming(
     coat_roughness=("coat_roughness", 0.0),
     normal=("geometry_normal", (0.0, 0.0, 1.0)),
     opacity=("geometry_opacity", 1.0),
+    subsurface=("subsurface_weight", 0.0),
+    subsurface_color=("subsurface_color", (0.8, 0.8, 0.8)),
     ignored=(
         ("specular_color", _WHITE),
         ("specular_roughness_anisotropy", 0.0),
         ("transmission_scatter", _BLACK),
-        ("subsurface_weight", 0.0),
         ("fuzz_weight", 0.0),
         ("thin_film_weight", 0.0),
         ("coat_color", _WHITE),
@@ -96,12 +101,13 @@ STANDARD_SURFACE = Naming(
     coat_roughness=("coat_roughness", 0.1),
     normal=("normal", (0.0, 0.0, 1.0)),
     opacity=("opacity", _WHITE),
+    subsurface=("subsurface", 0.0),
+    subsurface_color=("subsurface_color", _WHITE),
     ignored=(
         ("specular_color", _WHITE),
         ("specular_anisotropy", 0.0),
         ("transmission_scatter", _BLACK),
         ("transmission_extra_roughness", 0.0),
-        ("subsurface", 0.0),
         ("sheen", 0.0),
         ("thin_film_thickness", 0.0),
         ("coat_color", _WHITE),
@@ -147,8 +153,8 @@ def _product(context: Context, shader: UsdShade.Shader, color: Named, weight: Na
     tint, factor = _source(context, shader, color), _source(context, shader, weight)
     if is_constant(factor):
         return scaled(tint, max(factor.value[0], 0.0))
-    if is_constant(tint):
-        return scaled(factor, tint.value)
+    if (both := product(context, tint, factor)) is not None:
+        return both
     note(context, f"{color[0]} and {weight[0]} are both mapped; the map of {weight[0]} is ignored")
     return tint
 
@@ -156,7 +162,7 @@ def _product(context: Context, shader: UsdShade.Shader, color: Named, weight: Na
 def _common(context: Context, shader: UsdShade.Shader, naming: Naming) -> dict[Param, Source]:
     """Everything that maps onto a UsdPreviewSurface input one to one."""
     inputs = {
-        Param.DIFFUSE: _product(context, shader, naming.base_color, naming.base_weight),
+        Param.DIFFUSE: _diffuse(context, shader, naming),
         Param.EMISSIVE: _product(context, shader, naming.emission_color, naming.emission_weight),
         Param.METALLIC: _source(context, shader, naming.metallic),
         Param.ROUGHNESS: _source(context, shader, naming.roughness),
@@ -171,6 +177,21 @@ def _common(context: Context, shader: UsdShade.Shader, naming: Naming) -> dict[P
         param: clamped(context, param, source, f"inputs:{labels.get(param, param.name.lower())}")
         for param, source in inputs.items()
     }
+
+
+def _diffuse(context: Context, shader: UsdShade.Shader, naming: Naming) -> Source:
+    """The base colour, and for the share that scatters below the surface the colour of that."""
+    base = _product(context, shader, naming.base_color, naming.base_weight)
+    share = _source(context, shader, naming.subsurface)
+    if share == constant(0.0):
+        return base
+    found = mixed(context, _source(context, shader, naming.subsurface_color), base, share)
+    what = f"{kind_of(shader)} {naming.subsurface[0]}"
+    if found is None:
+        note(context, f"{what} is ignored, for it and the colours it mixes are mapped")
+        return base
+    note(context, f"{what} is drawn as diffuse reflection of its colour, for nothing scatters below a surface here")
+    return found
 
 
 def _normal(context: Context, shader: UsdShade.Shader, naming: Naming) -> Source:
@@ -253,7 +274,8 @@ def _note_ignored(context: Context, shader: UsdShade.Shader, naming: Naming) -> 
         if UsdShade.Output.IsOutput(attribute) or not off:
             names.append(name)
     if names:
-        note(context, f"{', '.join(names)} of {shader.GetShaderId()} is ignored; this renderer has no such effect")
+        note(context, f"{kind_of(shader)} input {', '.join(names)} of {shader.GetShaderId()} is ignored; "
+             "this renderer has no such effect")  # fmt: skip
 
 
 def _coverage(context: Context, shader: UsdShade.Shader, naming: Naming) -> tuple[Source, bool, float]:
@@ -305,7 +327,7 @@ def read_open_pbr(context: Context, shader: UsdShade.Shader, unit: float) -> Sur
 
 
 def read_standard_surface(context: Context, shader: UsdShade.Shader, unit: float) -> Surface:
-    """Autodesk Standard Surface 1.0: transmission_dispersion is the Abbe number, 0 for none."""
+    """Autodesk Standard Surface 1.0, and Arnold's; transmission_dispersion is the Abbe number, 0 for none."""
     abbe = read_number(context, shader.GetInput("transmission_dispersion"), 0.0)
     thin = bool(read_constant(context, shader.GetInput("thin_walled"), False))
     return replace(_read(context, shader, STANDARD_SURFACE, unit), abbe=max(abbe, 0.0), thin=thin)

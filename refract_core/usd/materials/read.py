@@ -15,7 +15,8 @@ from ...errors import StageError
 from ...models import BY_TOKEN, DEFAULT, MODELS, SHEET, SOLID, Model
 from ...scene import Material, Notice, Param, Source, Texture
 from .glass import READERS
-from .sources import Context, constant, is_constant, node_name, note, producer, read_number, read_source, scaled
+from .nodes import read_source
+from .sources import Context, constant, is_constant, node_name, note, producer, read_number, scaled
 from .surfaces import DEFAULTS, Surface, clamped, display_color_inputs, lowest, read_preview_surface
 from .vendors import CONTEXTS, vendor_id
 from .vendors import READERS as VENDOR_READERS
@@ -47,7 +48,7 @@ def read_material(
     Raises:
         StageError: `refraction:model` is not a known token.
     """
-    context = Context(str(material.GetPath()), time, textures, notices, [])
+    context = Context.of(str(material.GetPath()), time, textures, notices)
     surface, _ = read_surface(context, material, metres_per_unit)
     if has_api(material.GetPrim()):
         return _refraction(context, material, surface, metres_per_unit)
@@ -106,7 +107,7 @@ def read_surface(context: Context, material: UsdShade.Material, unit: float) -> 
             found.append(shader)
     known = [shader for shader in found if shader.GetShaderId() in (*_PREVIEW, *READERS)] or vendor_surfaces(material)
     for position, shader in enumerate(known):
-        trial = context._replace(textures=dict(context.textures), notices=list(context.notices), unsupported=[])
+        trial = context.trial()
         surface = _read_shader(trial, shader, unit)
         if not trial.unsupported or position == len(known) - 1:
             for key in list(trial.textures)[len(context.textures) :]:

@@ -9,7 +9,8 @@ from pxr import UsdShade
 
 from ...scene import Channel, Param, Source, Texture, Wrap
 from ..values import finite
-from .sources import Context, Value, constant, is_constant, note, read_constant, read_number, read_source
+from .nodes import read_source
+from .sources import Context, Value, constant, is_constant, note, read_constant, read_number
 
 GREY = 0.18
 """displayColor where none is authored, as UsdPreviewSurface's diffuseColor (Sdr definition of usd-core)."""

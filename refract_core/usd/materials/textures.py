@@ -10,6 +10,7 @@ from ...errors import ImageError
 from ...scene import Texture
 
 COLOR_SPACES = ("auto", "raw", "sRGB")
+_MADE = "made: "
 
 
 def resolve_asset(attribute: Usd.Attribute, time: Usd.TimeCode) -> str:
@@ -40,6 +41,16 @@ def of_key(key: str) -> tuple[str, str]:
         if key.endswith(f" ({space})"):
             return key.removesuffix(f" ({space})"), space
     return key, "auto"
+
+
+def made(what: str) -> str:
+    """Name of a picture that no file holds, but that was made of others or of nothing."""
+    return f"{_MADE}{what}"
+
+
+def is_made(key: str) -> bool:
+    """The texture of that name cannot be read from a file."""
+    return key.startswith(_MADE)
 
 
 def read_texture(path: str, color_space: str) -> Texture:

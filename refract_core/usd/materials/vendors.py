@@ -11,7 +11,8 @@ from pxr import UsdShade
 
 from ...scene import Param, Source
 from .glass import read_standard_surface
-from .sources import Context, Value, constant, note, producer, read_constant, read_number, read_source, scalar, scaled
+from .nodes import read_source
+from .sources import Context, Value, constant, note, producer, read_constant, read_number, scalar, scaled
 from .surfaces import Surface, clamped
 
 CONTEXTS = ("arnold", "mdl", "ri")
