@@ -66,10 +66,12 @@ def checked(paths: list[str], root: str) -> list[str]:
 
 
 def _look(root: str, stage: str, layers: int, unpacked_bytes: int) -> dict[str, Any]:
+    from refract_core.usd.layers import mtlx
     from refract_core.usd.layers.assets import files_of as all_files_of
 
     from . import precheck
 
+    mtlx.make_ready()
     root = os.path.realpath(root)
     os.chdir(root)
     confine.confine([*own_files(), root], [], _MEANS)

@@ -17,6 +17,7 @@ from pxr import Ar, Sdf, Tf, UsdUtils
 
 from refract_core.errors import StageError
 from refract_core.usd.diagnostics import captured
+from refract_core.usd.layers import mtlx
 from refract_core.usd.prim_count import count_prims
 
 from .gltf_parts import parts_of
@@ -109,6 +110,8 @@ def _names(place: Place, held: list[Sdf.Layer]) -> list[tuple[str, bool]]:
         return []
     if not place.inner and place.file.lower().endswith(GLTF):
         return [(name, False) for name in parts_of(place.file)]
+    if mtlx.is_file(place.name()):
+        return [(name, False) for name in mtlx.written_in(place.name())]
     if not (place.inner or place.file).lower().endswith(_LAYERS):
         return []
     with captured():

@@ -125,9 +125,11 @@ def _warm() -> int:
     import refract_core.usd.stage
     import refract_core.verbs.convert
     import refract_core.verbs.inspect  # noqa: F401
+    from refract_core.usd.layers import mtlx
 
     from . import precheck, tasks, warm  # noqa: F401  the first is needed once USD is open
 
+    mtlx.make_ready()
     warm.draw()
     os.sched_setaffinity(0, cores)
     return len(os.listdir("/proc/self/task"))

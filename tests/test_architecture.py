@@ -23,6 +23,7 @@ ROOMS = {
     "llvmlite": ("refract_core.kernels",),
     "numba": ("refract_core.kernels.jit", "refract_core.kernels.linking", "refract_core.kernels.pointer_type"),
     "OpenImageIO": ("refract_core.images",),
+    "MaterialX": ("refract_core.usd.layers.mtlx_file",),
     "pygltflib": ("refract_core.usd.convert.gltf_file",),
     "flip_evaluator": ("refract_core.verbs.compare",),
     "distributed": ("refract_core.verbs.executors", "service.cluster", "service.cluster_worker"),
@@ -44,7 +45,8 @@ WINGS = (
 )  # fmt: skip
 # The same inside the wing that is a house of its own.
 USD_ROOMS = (
-    "diagnostics", "values", "registering", "ours", "layers", "materials", "geometry", "lights", "probes", "stage",
+    "diagnostics", "values", "registering", "ours", "layers", "materials", "geometry", "lights", "probes", "preview",
+    "stage",
     "convert", "thickness", "rules",
 )  # fmt: skip
 

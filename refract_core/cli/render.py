@@ -14,7 +14,9 @@ from ..verbs.override import COLORS, RANGES
 from ..verbs.render_files import Order, render_files
 from .app import Jobs, ProgressMode, app, outcome, words
 
-Stage = Annotated[str, typer.Argument(metavar="STAGE", help="The .usd, .usda, .usdc or .usdz file to render.")]
+Stage = Annotated[
+    str, typer.Argument(metavar="STAGE", help="The .usd, .usda, .usdc or .usdz file to render, or a .mtlx file.")
+]
 Out = Annotated[
     str,
     typer.Argument(

@@ -26,6 +26,7 @@ from pxr import Sdf, Tf
 
 from ..errors import StageError
 from .diagnostics import captured, words_of
+from .layers import mtlx
 
 CEILING = 10**18
 """Numbers are cut here: 100,000 levels that double would have 30,000 digits."""
@@ -183,7 +184,10 @@ class _Layers:
         key = (anchor.identifier, name)
         if key not in self._found:
             try:
-                self._found[key] = Sdf.Layer.FindOrOpenRelativeToLayer(anchor, name) if name else None
+                if mtlx.is_file(name):
+                    self._found[key] = mtlx.layer_of(anchor, name)
+                else:
+                    self._found[key] = Sdf.Layer.FindOrOpenRelativeToLayer(anchor, name) if name else None
             except Tf.ErrorException:  # missing or damaged: USD composes what is left
                 self._found[key] = None
         return self._found[key]

@@ -23,9 +23,11 @@ from .geometry.place import Placed, bounds_of, place, to_mesh, to_sphere
 from .geometry.shapes import INWARDS, TURN, Shape, read_shape
 from .geometry.skel import posed
 from .geometry.traverse import Placement, refuse_too_many, some_of, walk
+from .layers import mtlx
 from .lights.meshes import glowing
 from .lights.read import read_lights
 from .ours import recognised
+from .preview import preview_stage
 from .probes.pictures import read_cubemap
 from .probes.read import read_probes
 from .registering import register
@@ -42,7 +44,7 @@ _VARIANT = re.compile(r"(?P<prim>(?:/\w+)*)\{(?P<set>[^{}=]{1,200})=(?P<name>[^{
 
 
 def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
-    """Opens a stage, with the newest content of its files.
+    """Opens a stage, with the newest content of its files; of a .mtlx file, balls of its materials.
 
     What composition left out is reported by `scene_from_stage`, as notices of the scene.
 
@@ -63,7 +65,7 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
         raise StageError(f"{name}: cannot be read as .usd, .usda, .usdc or .usdz: {reason}")
     with captured() as heard:
         try:
-            stage = Usd.Stage.Open(name)
+            stage = preview_stage(name) if mtlx.is_file(name) else Usd.Stage.Open(name)
         except Tf.ErrorException as error:
             heard.extend(words_of(part) for part in error.args)
             stage = None
@@ -72,8 +74,10 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
         raise StageError(f"{name}: cannot be read as .usd, .usda, .usdc or .usdz: {reason}")
     with captured():
         for layer in stage.GetUsedLayers():  # USD keeps layers in memory; a changed file would show its old content
+            mtlx.forget_old(layer)
             if not layer.anonymous and not layer.dirty:
                 layer.Reload()
+        mtlx.stand_in(stage)
         recognised(stage)
     refuse_too_many(stage)
     return stage
@@ -103,6 +107,7 @@ def select_variants(stage: Usd.Stage, chosen: Iterable[str]) -> None:
             raise UsageError(f"variant '{text[:200]}': choose from {', '.join(one.GetVariantNames())}")
         with Usd.EditContext(stage, stage.GetSessionLayer()), captured():
             one.SetVariantSelection(found["name"])
+            mtlx.stand_in(stage)
 
 
 def time_range(stage: Usd.Stage) -> tuple[float, float]:
@@ -181,10 +186,14 @@ def _composition_notices(stage: Usd.Stage) -> list[Notice]:
     """What composition could not bring together: missing references, payloads, sublayers."""
     root = stage.GetRootLayer().identifier
     found = []
+    unread = dict(mtlx.told(stage))
+    found += [Notice(path, text) for path, text in mtlx.told(stage)]
     for error in stage.GetCompositionErrors():
         prim = error.rootSite.path
         where = root if prim in (Sdf.Path.emptyPath, Sdf.Path.absoluteRootPath) else str(prim)
         text = " ".join(str(error).split())
+        if any(f"@{path}@" in text for path in unread):
+            continue
         found.append(Notice(where, f"part of the stage is missing, the rest is used: {text}"))
     return found
 

@@ -1,3 +1,3 @@
 """Layers: asset paths, packages, thin layers over a stage, and their way to disk. Knows none of our schemas."""
 
-__all__ = ["assets", "write"]
+__all__ = ["assets", "mtlx", "write"]

@@ -9,6 +9,7 @@ from pxr import Ar, Sdf, Tf, UsdUtils
 
 from ...errors import StageError
 from ..diagnostics import captured, words_of
+from . import mtlx
 
 # --- one path ----------------------------------------------------------------------------------------------------
 
@@ -48,7 +49,11 @@ def dependencies(path: str) -> tuple[list[str], list[str]]:
     """
     with captured():
         layers, assets, missing = UsdUtils.ComputeAllDependencies(Sdf.AssetPath(path))
-    return _on_disk([path, *(layer.realPath for layer in layers), *assets]), list(missing)
+    found = [path, *(layer.realPath for layer in layers), *map(str, assets)]
+    found += [file for layer in layers for file in mtlx.replaced_in(layer)]
+    for file in [one for one in found if one.lower().endswith(mtlx.EXTENSION)]:  # USD does not look into it
+        found += mtlx.pictures_of(file)
+    return _on_disk(found), [name for name in missing if not mtlx.stands_in(name)]
 
 
 def files_of(path: str) -> list[str]:
@@ -92,6 +97,7 @@ def copy_of(layer: Sdf.Layer) -> Sdf.Layer:
     """The same content in memory, to be edited without anybody noticing."""
     copy = Sdf.Layer.CreateAnonymous("copy.usda")
     copy.TransferContent(layer)
+    mtlx.as_authored(layer, copy)
     return copy
 
 

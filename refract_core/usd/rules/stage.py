@@ -10,6 +10,7 @@ from pxr import Tf, Usd, UsdGeom
 from ...errors import StageError
 from ...scene import Notice, Scene
 from ..diagnostics import captured, words_of
+from ..layers import mtlx
 from ..stage import scene_from_stage
 from .findings import ERROR, INFO, WARNING, Finding, Repair, Rule
 from .glass import FLAT_SPHERE, INSIDE_OUT, NO_UV, OPEN, SIZE, TRACED_OPEN, UNITS, Glass, glass_findings, glass_of
@@ -120,7 +121,15 @@ def stock_findings(stage: Usd.Stage) -> list[Finding]:
             "",
         )
         for error in errors
+        if not _is_materialx(error)
     ]
+
+
+def _is_materialx(error: object) -> bool:
+    """About a MaterialX node that is not in the registry, for usd-core brings no definitions of them; or about a file
+    that is read by us, for it has no reader of them either."""
+    name, text = str(error.GetName()), str(error.GetMessage())  # type: ignore[attr-defined]
+    return (name == "MissingShaderIdInRegistry" and "'ND_" in text) or mtlx.stands_in(text)
 
 
 def _site(error: object, stage: Usd.Stage) -> str:
