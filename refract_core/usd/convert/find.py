@@ -138,7 +138,8 @@ def _may_transmit(material: UsdShade.Material) -> bool:
 def _name(shader: UsdShade.Shader | None) -> str:
     if shader is None:
         return ""
-    return str(shader.GetShaderId() or vendor_id(shader)).removeprefix("ND_").removesuffix("_surfaceshader")
+    name = str(shader.GetShaderId() or vendor_id(shader).removeprefix("mdl:"))
+    return name.removeprefix("ND_").removesuffix("_surfaceshader")
 
 
 def _constant(surface: Surface, param: Param, default: float) -> tuple[float, str]:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
-from pxr import UsdShade
+from pxr import Sdf, Usd, UsdShade
 
 from ...errors import ImageError
 from ...scene import Channel, Source, Wrap
@@ -91,17 +91,34 @@ def _file(shader: UsdShade.Shader) -> UsdShade.Input:
 
 def _texture_index(context: Context, shader: UsdShade.Shader, color_space: str) -> int:
     """Load the node's `file`; -1 with a notice where that fails."""
-    attribute = producer(context, _file(shader))
+    return _loaded(context, producer(context, _file(shader)), color_space, shader.GetPath())
+
+
+def picture_index(context: Context, attribute: Usd.Attribute, unless: str, where: Sdf.Path) -> int:
+    """Load the picture of an asset-valued attribute, in the colour space of its metadata.
+
+    Args:
+        unless: the colour space where it has none.
+        where: what a notice is about.
+
+    Returns:
+        Its index in the context's textures; -1 with a notice where it cannot be read.
+    """
+    chosen = str(attribute.GetColorSpace()) if attribute.HasColorSpace() else unless
+    return _loaded(context, attribute, _known_space(context, chosen, where), where)
+
+
+def _loaded(context: Context, attribute: Usd.Attribute | None, color_space: str, where: Sdf.Path) -> int:
     path = resolve_asset(attribute, context.time) if attribute is not None else ""
     if not path:
-        note(context, "has no file; its fallback colour is used", shader.GetPath())
+        note(context, "has no file; its fallback colour is used", where)
         return -1
     key = texture_key(path, color_space)
     if key not in context.textures:
         try:
             context.textures[key] = read_texture(path, color_space)
         except ImageError as error:
-            note(context, f"texture cannot be read: {error}; its fallback colour is used", shader.GetPath())
+            note(context, f"texture cannot be read: {error}; its fallback colour is used", where)
             return -1
     return list(context.textures).index(key)
 
@@ -112,6 +129,11 @@ def _color_space(context: Context, shader: UsdShade.Shader) -> str:
     attribute = producer(context, _file(shader))
     if chosen == "auto" and attribute is not None and attribute.HasColorSpace():
         chosen = str(attribute.GetColorSpace())
+    return _known_space(context, chosen, shader.GetPath())
+
+
+def _known_space(context: Context, chosen: str, where: Sdf.Path) -> str:
+    """raw, sRGB or auto, whatever a file calls it."""
     if chosen in COLOR_SPACES or not chosen:
         return chosen or "auto"
     lowered = chosen.lower()
@@ -119,7 +141,7 @@ def _color_space(context: Context, shader: UsdShade.Shader) -> str:
         return "sRGB"
     if lowered in ("lin_rec709", "lin_rec709_scene", "linear", "data", "identity", "unknown"):
         return "raw"
-    note(context, f"colour space '{chosen}' is not converted; it is read as 'auto'", shader.GetPath())
+    note(context, f"colour space '{chosen}' is not converted; it is read as 'auto'", where)
     return "auto"
 
 

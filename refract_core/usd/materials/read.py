@@ -15,8 +15,9 @@ from ...errors import StageError
 from ...models import BY_TOKEN, DEFAULT, MODELS, SHEET, SOLID, Model
 from ...scene import Material, Notice, Param, Source, Texture
 from .glass import READERS
+from .mdl import mdl_name
 from .nodes import read_source
-from .sources import Context, constant, is_constant, node_name, note, producer, read_number, scaled
+from .sources import Context, constant, is_constant, kind_of, node_name, note, producer, read_number, scaled
 from .surfaces import DEFAULTS, Surface, clamped, display_color_inputs, lowest, read_preview_surface
 from .vendors import CONTEXTS, vendor_id
 from .vendors import READERS as VENDOR_READERS
@@ -136,7 +137,13 @@ def _read_shader(context: Context, shader: UsdShade.Shader, unit: float) -> Surf
 def _unknown_surface(context: Context, material: UsdShade.Material, found: list[UsdShade.Shader]) -> Surface:
     """displayColor, with a notice that names what stands there; only roughness and opacity 0 under our API."""
     others = [o.GetFullName() for o in material.GetOutputs() if o.GetBaseName().rpartition(":")[2] == "surface"]
-    if found:
+    shaders = [material.ComputeSurfaceSource(context)[0] for context in ("", *CONTEXTS)]
+    modules = [name for shader in shaders if shader and (name := mdl_name(shader))]
+    if modules:
+        what = f"MDL material '{modules[0]}' is not read"
+    elif found and kind_of(found[0]) == "MaterialX":
+        what = f"MaterialX surface {node_name(found[0])} is not one this renderer reads"
+    elif found:
         what = f"surface shader {found[0].GetPath()} {node_name(found[0])} is not one this renderer reads"
     elif others:
         what = f"{', '.join(others)} leads to no surface shader this renderer reads"

@@ -1,4 +1,4 @@
-"""Glass in the shaders of single renderers, as `Surface` records: Arnold, OmniGlass, PxrSurface.
+"""Shaders of single renderers, as `Surface` records: Arnold, Omniverse (`mdl`), the glass of PxrSurface.
 
 They are looked at where a material has no MaterialX or universal surface that is understood.
 """
@@ -10,32 +10,15 @@ from collections.abc import Callable
 from pxr import UsdShade
 
 from ...scene import Param, Source
+from . import mdl
 from .glass import read_standard_surface
 from .nodes import read_source
-from .sources import Context, Value, constant, note, producer, read_constant, read_number, scalar, scaled
+from .sources import Context, Value, note, producer, read_constant, read_number, scalar, scaled
 from .surfaces import Surface, clamped
 
 CONTEXTS = ("arnold", "mdl", "ri")
 """Render contexts of the outputs these shaders stand on: outputs:<context>:surface."""
 _WHITE = (1.0, 1.0, 1.0)
-
-
-def read_omni_glass(context: Context, shader: UsdShade.Shader, unit: float) -> Surface:
-    """OmniGlass (docs.omniverse.nvidia.com, Templates): always clear; its colour is taken for a tint.
-
-    `depth`, the "volume absorption scale", is left: what length or strength it stands for is not published.
-    """
-    inputs = {
-        Param.DIFFUSE: constant((0.0, 0.0, 0.0)),
-        Param.ROUGHNESS: _read(context, shader, Param.ROUGHNESS, "frosting_roughness", 0.0),
-        Param.IOR: _read(context, shader, Param.IOR, "glass_ior", 1.491),
-        Param.TRANSMITTANCE: _read(context, shader, Param.TRANSMITTANCE, "glass_color", _WHITE),
-        Param.OPACITY: constant(0.0),
-    }
-    textures = ("glass_color_texture", "roughness_texture", "normal_map_texture", "cutout_opacity_texture")
-    _note_authored(context, shader, ("depth", "reflection_color", "enable_opacity", *textures))
-    thin = bool(read_constant(context, shader.GetInput("thin_walled"), False))
-    return Surface(inputs=inputs, opacity_authored=True, glass=True, thin=thin)
 
 
 def read_pxr_surface(context: Context, shader: UsdShade.Shader, unit: float) -> Surface:
@@ -67,22 +50,19 @@ def _note_authored(context: Context, shader: UsdShade.Shader, names: tuple[str, 
 
 READERS: dict[str, Callable[[Context, UsdShade.Shader, float], Surface]] = {
     "arnold:standard_surface": read_standard_surface,
-    "OmniGlass": read_omni_glass,
     "PxrSurface": read_pxr_surface,
+    **{f"mdl:{name}": reader for name, reader in mdl.READERS.items()},
 }
 
 
 def vendor_id(shader: UsdShade.Shader) -> str:
-    """The key of a shader in `READERS`: its id, or what it takes out of an MDL module. '' if it is not one of them.
+    """The key of a shader in `READERS`: its id, or `mdl:` and what it takes out of an MDL module. '' if it is none.
 
     A PxrSurface counts only where it refracts: the rest of it is not read.
     """
     name = str(shader.GetShaderId() or "")
-    if not name and shader.GetImplementationSource() == "sourceAsset":
-        name = str(shader.GetSourceAssetSubIdentifier("mdl") or "")
-        if not name:  # a module's one material has the module's name
-            asset = shader.GetSourceAsset("mdl")
-            name = asset.path.rsplit("/", 1)[-1].removesuffix(".mdl") if asset else ""
+    if not name and (inside := mdl.mdl_name(shader)):
+        name = f"mdl:{inside}"
     if name == "PxrSurface" and not _authored(shader, "refractionGain"):
         return ""
     return name if name in READERS else ""
