@@ -95,6 +95,17 @@ def test_half_the_specular_weight_halves_the_normal_reflectance() -> None:
     assert f0(half[Param.IOR].value[0]) == pytest.approx(0.5 * f0(whole))
 
 
+def test_an_unlit_surface_glows_and_reflects_nothing() -> None:
+    text = shader("float inputs:emission = 2\ncolor3f inputs:emission_color = (1, 0.5, 0)\nfloat inputs:opacity = 0.5",
+                  identifier="ND_surface_unlit", output="mtlx:surface")  # fmt: skip
+    found = Reading(stage_of(text))
+    assert found[Param.EMISSIVE].value[:3] == pytest.approx((2.0, 1.0, 0.0))
+    assert found[Param.DIFFUSE].value[:3] == (0.0, 0.0, 0.0)
+    assert found[Param.IOR].value[0] == 1.0  # no reflectance at normal incidence
+    assert found.material.opacity_presence
+    assert not found.notices
+
+
 IMAGE = """
     def Shader "I"
     {

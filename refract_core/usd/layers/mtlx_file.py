@@ -7,7 +7,7 @@ entities), and nothing it includes is read.
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, NamedTuple
 from xml.parsers import expat
 
@@ -16,7 +16,7 @@ from ..values import finite, numbers
 
 LARGEST = 1 << 24
 """Bytes of a file."""
-ELEMENTS = 100_000
+ELEMENTS = 50_000
 _DEEPEST = 32
 EXTRA = "needs the extra `mtlx`: pip install 'usd-refract[mtlx]'"
 
@@ -68,6 +68,7 @@ class Document(NamedTuple):
     notices: tuple[str, ...]
 
 
+@lru_cache(maxsize=2)  # a stage's files are looked through before they are composed
 def read_document(content: bytes) -> Document:
     """Parse a file.
 

@@ -342,8 +342,22 @@ def read_gltf_pbr(context: Context, shader: UsdShade.Shader, unit: float) -> Sur
     return replace(surface, abbe=20.0 / dispersion if dispersion > 0.0 else 0.0, thin=thin)
 
 
+def read_unlit(context: Context, shader: UsdShade.Shader, unit: float) -> Surface:
+    """MaterialX `surface_unlit`: it glows, and reflects nothing. What it transmits is left out."""
+    color = _product(context, shader, ("emission_color", _WHITE), ("emission", 1.0))
+    opacity = scalar(_source(context, shader, ("opacity", 1.0)))
+    if read_source(context, shader.GetInput("transmission"), 0.0) != constant(0.0):
+        note(context, "MaterialX input transmission of ND_surface_unlit is ignored")
+    inputs = {
+        Param.DIFFUSE: constant(_BLACK), Param.EMISSIVE: color, Param.OPACITY: opacity, Param.IOR: constant(1.0),
+    }  # fmt: skip
+    presence = lowest(opacity, context.textures) < 1.0
+    return Surface(inputs=inputs, opacity_authored=True, opacity_presence=presence)
+
+
 READERS: dict[str, Callable[[Context, UsdShade.Shader, float], Surface]] = {
     "ND_open_pbr_surface_surfaceshader": read_open_pbr,
     "ND_standard_surface_surfaceshader": read_standard_surface,
     "ND_gltf_pbr_surfaceshader": read_gltf_pbr,
+    "ND_surface_unlit": read_unlit,
 }
