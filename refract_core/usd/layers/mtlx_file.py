@@ -115,7 +115,7 @@ def check(content: bytes) -> None:
     try:
         parser.Parse(content, True)
     except expat.ExpatError as error:
-        raise Unreadable(f"it is not XML: {error}") from error
+        raise Unreadable(f"it is not XML, from line {error.lineno} on") from error
 
 
 def _wheel() -> Any:
