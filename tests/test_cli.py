@@ -103,7 +103,8 @@ def test_without_flags_the_defaults_are_rendered(engine: Engine, tmp_path: Path)
     assert refract("render", "a.usda", tmp_path / "a.png").code == 0
     assert engine.settings == [rc.RenderSettings()]
     assert engine.stages == ["a.usda"]
-    assert engine.scenes == [{"time_code": None, "purposes": ("default", "render"), "camera": ""}]
+    plain = {"time_code": None, "purposes": ("default", "render"), "camera": "", "complexity": "low"}
+    assert engine.scenes == [plain]
     assert files(tmp_path) == ["a.png"]
 
 
@@ -209,11 +210,9 @@ def test_json_errors_are_objects_too(engine: Engine, tmp_path: Path) -> None:
     assert json.loads(ended.err)["event"] == "error"
 
 
-def test_complexity_is_accepted_and_says_what_it_does_not_do(engine: Engine, tmp_path: Path) -> None:
-    assert "--complexity" not in refract("render", "a.usda", tmp_path / "a.png").err
-    ended = refract("render", "a.usda", tmp_path / "a.png", "--complexity", "high")
-    assert ended.code == 0
-    assert "warning: --complexity: subdivision is not done yet" in ended.err
+def test_complexity_goes_to_the_reader(engine: Engine, tmp_path: Path) -> None:
+    assert refract("render", "a.usda", tmp_path / "a.png", "--complexity", "high").code == 0
+    assert [how["complexity"] for how in engine.scenes] == ["high"]
 
 
 # --- refused before any work

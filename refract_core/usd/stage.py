@@ -18,8 +18,10 @@ from ..errors import StageError, UsageError
 from ..scene import F64, Mesh, Notice, Scene, Sphere, prim_of
 from .camera import choose_camera, read_cameras
 from .diagnostics import captured, words_of
-from .geometry.parts import Bound, Part, Tables, assemble, bind
+from .geometry.cages import FINENESS
+from .geometry.parts import MOST_IN_ALL, Bound, Part, Tables, affordable, assemble, bind
 from .geometry.place import Placed, bounds_of, place, to_mesh, to_sphere
+from .geometry.refined import MOST_TRIANGLES, Fineness
 from .geometry.shapes import INWARDS, TURN, Shape, read_shape
 from .geometry.skel import posed
 from .geometry.traverse import Placement, refuse_too_many, some_of, walk
@@ -122,6 +124,7 @@ def load_stage(
     time_code: float | None = None,
     purposes: tuple[str, ...] = ("default", "render"),
     camera: str = "",
+    complexity: str = "low",
 ) -> Scene:
     """Reads a stage at one time.
 
@@ -129,12 +132,14 @@ def load_stage(
         time_code: None takes the stage's startTimeCode, or 0 where it has none
         purposes: which of default, render, proxy and guide are drawn
         camera: prim path or name of the camera that `Scene.cameras` begins with; '' chooses one
+        complexity: how fine subdivision surfaces are: low, medium, high or veryhigh
 
     Raises:
         StageError: the stage cannot be opened or read.
-        UsageError: it has no such camera.
+        UsageError: it has no such camera, or there is no such complexity.
     """
-    return scene_from_stage(open_stage(path), time_code=time_code, purposes=purposes, camera=camera)
+    how: dict[str, Any] = {"time_code": time_code, "purposes": purposes, "camera": camera, "complexity": complexity}
+    return scene_from_stage(open_stage(path), **how)
 
 
 def scene_from_stage(
@@ -143,6 +148,7 @@ def scene_from_stage(
     time_code: float | None = None,
     purposes: tuple[str, ...] = ("default", "render"),
     camera: str = "",
+    complexity: str = "low",
     keep: Keep | None = None,
 ) -> Scene:
     """Reads an opened stage at one time; see `load_stage`. The stage is not changed.
@@ -152,13 +158,15 @@ def scene_from_stage(
     """
     if time_code is not None and not math.isfinite(time_code):
         raise UsageError(f"time_code is {time_code}; it must be a finite number")
+    if complexity not in FINENESS:
+        raise UsageError(f"complexity is '{complexity}', not known; choose from {', '.join(FINENESS)}")
     time = Usd.TimeCode(time_range(stage)[0] if time_code is None else time_code)
     notices = _composition_notices(stage)
     with captured():  # composing again repeats the same warnings
         stage = recognised(posed(stage, time, notices))
     with captured() as heard:
         try:
-            scene = _read(stage, time, purposes, camera, notices, keep)
+            scene = _read(stage, time, purposes, camera, complexity, notices, keep)
         except Tf.ErrorException as error:
             reason = words_of(error.args[0])
             raise StageError(f"{stage.GetRootLayer().identifier}: USD cannot read it: {reason}") from error
@@ -206,13 +214,13 @@ def _origin(low: F64, high: F64) -> F64:
 
 
 def _read(
-    stage: Usd.Stage, time: Usd.TimeCode, purposes: tuple[str, ...], camera: str, notices: list[Notice],
-    keep: Keep | None,
+    stage: Usd.Stage, time: Usd.TimeCode, purposes: tuple[str, ...], camera: str, complexity: str,
+    notices: list[Notice], keep: Keep | None,
 ) -> Scene:  # fmt: skip
     """Everything of a stage in engine world, whose origin is the middle of what is drawn."""
     metres_per_unit = stage_unit(stage, notices)
     metres_from_stage = _upright(stage, notices) @ np.diag([metres_per_unit] * 3 + [1.0])
-    tables = Tables(time, metres_per_unit, notices)
+    tables = Tables(time, metres_per_unit, notices, FINENESS[complexity])
     drawn = walk(stage, time, purposes, notices)
     placed = _placed(keep(drawn, tables) if keep else drawn, metres_from_stage, tables)
     extent = bounds_of(placed)
@@ -297,12 +305,10 @@ def _placed(placements: list[Placement], metres_from_stage: F64, tables: Tables)
     prims = list({placement.prim.GetPath(): placement.prim for placement in placements}.values())
     shapes: dict[Sdf.Path, Shape | None] = {}
     parts: dict[Sdf.Path, Part | None] = {}
+    asked, tables.fineness = tables.fineness, affordable(placements, tables.time, tables.fineness)
     for prim, bound in zip(prims, bind(prims, tables.notices), strict=True):
         parts[prim.GetPath()] = _part(prim, bound, shapes, tables)
-    cages = [str(path) for path, part in parts.items() if part is not None and part.shape.cage]
-    if cages:
-        text = "subdivision surfaces are drawn as their control cage, with smooth normals: subdivision is not done yet"
-        tables.notices.append(Notice(cages[0], f"{text} ({some_of(cages)})"))
+    tables.notices.extend(_coarse(parts, asked, tables.fineness))
     tables.notices.extend(_turned(prims, parts))
     placed = []
     for placement in placements:
@@ -311,6 +317,19 @@ def _placed(placements: list[Placement], metres_from_stage: F64, tables: Tables)
         if item is not None:
             placed.append(item)
     return placed
+
+
+def _coarse(parts: dict[Sdf.Path, Part | None], asked: Fineness, used: Fineness) -> Iterator[Notice]:
+    """Subdivision surfaces that are not as fine as they were asked to be."""
+    shapes = {str(path): part.shape for path, part in parts.items() if part is not None}
+    if cages := [path for path, shape in shapes.items() if shape.cage]:
+        text = f"drawn as its cage, with smooth normals: its surface would have over {MOST_TRIANGLES:,} triangles"
+        yield Notice(cages[0], f"{text} ({some_of(cages)})")
+    less = [path for path, shape in shapes.items() if shape.coarse or (shape.subdivided and used.steps < asked.steps)]
+    if less:
+        text = f"subdivided fewer than {asked.steps} times: more would make over {used.triangles:,} triangles of a mesh"
+        text += f", or over {MOST_IN_ALL:,} of all" if used.steps < asked.steps else ""
+        yield Notice(less[0], f"{text} ({some_of(less)})")
 
 
 def _turned(prims: list[Usd.Prim], parts: dict[Sdf.Path, Part | None]) -> Iterator[Notice]:
@@ -333,10 +352,13 @@ def _part(prim: Usd.Prim, bound: Bound, shapes: dict[Sdf.Path, Shape | None], ta
     shared = prim.IsInstanceProxy()
     key = prim.GetPrimInPrototype().GetPath() if shared else prim.GetPath()
     try:
-        shape = shapes[key] if key in shapes else read_shape(prim, tables.time, tables.notices)
+        shape = shapes[key] if key in shapes else read_shape(prim, tables.time, tables.notices, tables.fineness)
         if shared:
             shapes[key] = shape
-        return assemble(prim, shape, bound, tables) if shape is not None else None
+        part = assemble(prim, shape, bound, tables) if shape is not None else None
+        if part is not None and part.shape.subdivided:  # what it is made of is far larger than it is
+            part = part._replace(shape=replace(part.shape, topology=None))
+        return part
     except Tf.ErrorException as error:
         reason = " ".join(words_of(part) for part in error.args)
         tables.notices.append(Notice(str(prim.GetPath()), f"skipped: USD cannot read it: {reason}"))

@@ -90,6 +90,7 @@ class _Shot(NamedTuple):
     materials: Overrides
     aovs: tuple[str, ...]
     color_correction: str
+    complexity: str
     first: bool
     """Looks for stale probes as well, and for overrides that name nothing."""
 
@@ -123,11 +124,9 @@ def _render_jobs(
     report.progress(0.0, "reading the stage")
     stage = open_stage(order.stage)
     found: list[Notice] = []
-    if order.complexity != "low":
-        found.append(Notice("--complexity", "subdivision is not done yet, so every complexity draws the same"))
     settings = chosen_settings(read_settings(stage, order.settings_prim, found), order.overrides)
     tell(found)
-    choices = settings, order.materials, order.aovs, order.color_correction
+    choices = settings, order.materials, order.aovs, order.color_correction, order.complexity
     shots = [_Shot(job.time_code, job.path, *choices, job is jobs[0]) for job in jobs]
     if crew is None:
         _render_here(stage, shots, tell, report, cancel)
@@ -179,7 +178,7 @@ def _draw(
     scene = changed(strict=shot.first, **_how(shot))
     tell(scene.notices)
     if shot.first:
-        tell(_stale(changed, scene, settings))
+        tell(_stale(changed, scene, shot))
     stop_if(cancel, _STATE)
     frame = render(scene, settings, progress=progress, cancel=cancel, session=session)
     tell(frame.notices)
@@ -188,7 +187,8 @@ def _draw(
 
 def _how(shot: _Shot) -> dict[str, Any]:
     """What of a stage to read for a shot."""
-    return {"time_code": shot.time_code, "purposes": shot.settings.purposes, "camera": shot.settings.camera}
+    chosen = {"purposes": shot.settings.purposes, "camera": shot.settings.camera, "complexity": shot.complexity}
+    return {"time_code": shot.time_code, **chosen}
 
 
 def _render_elsewhere(
@@ -236,12 +236,14 @@ def _say_done(report: Report, shot: _Shot, width: int, height: int, seconds: flo
     report.done(shot.path, f"{width} x {height}, {size_text(size)}, {seconds:.1f} s")
 
 
-def _stale(read: Callable[..., Scene], scene: Scene, settings: RenderSettings) -> list[Notice]:
-    """Baked probes that no longer show what is there; each is asked about the time it was baked at."""
+def _stale(read: Callable[..., Scene], scene: Scene, shot: _Shot) -> list[Notice]:
+    """Baked probes that no longer show what is there; each is asked about the time it was baked at, and about surfaces
+    as coarse as they were then."""
     if not any(probe.bake for probe in scene.probes):
         return []
     def scene_at(time_code: float) -> Scene:
-        if time_code == scene.time_code and settings.purposes == RenderSettings().purposes:
+        as_baked = shot.settings.purposes == RenderSettings().purposes and shot.complexity == COMPLEXITIES[0]
+        if time_code == scene.time_code and as_baked:
             return scene
         return read(time_code=time_code)
 

@@ -36,7 +36,7 @@ class Use(NamedTuple):
     typed: bool
     """It has primvars:refraction:thickness already."""
     cage: bool
-    """The control cage of a subdivision surface, which is what is drawn."""
+    """The control cage of a subdivision surface that is too large to be subdivided, so it is what is drawn."""
 
 
 def find_uses(stage: Usd.Stage, time: Usd.TimeCode, materials: Iterable[str]) -> dict[str, list[Use]]:
@@ -119,16 +119,20 @@ def _divided(
         yield place, shape.triangles[of_triangle == row]
 
 
-_TOPOLOGY = ("points", "faceVertexCounts", "faceVertexIndices", "holeIndices", "orientation", "subdivisionScheme")
+_ARRAYS = (
+    "points", "faceVertexCounts", "faceVertexIndices", "holeIndices", "creaseIndices", "creaseLengths",
+    "creaseSharpnesses", "cornerIndices", "cornerSharpnesses",
+)  # fmt: skip
+_TOKENS = ("orientation", "subdivisionScheme", "interpolateBoundary", "triangleSubdivisionRule")
 
 
 def _signature(prim: Usd.Prim, time: Usd.TimeCode) -> Hashable:
     """The same for prims of the same shape, so that it is looked at once."""
     if prim.GetTypeName() != "Mesh":
         return original(prim)
-    values = [prim.GetAttribute(name).Get(time) for name in _TOPOLOGY]
-    arrays = [None if value is None else hash(np.asarray(value).tobytes()) for value in values[:4]]
-    return (*arrays, *map(str, values[4:]))
+    values = [prim.GetAttribute(name).Get(time) for name in _ARRAYS]
+    arrays = [None if value is None else hash(np.asarray(value).tobytes()) for value in values]
+    return (*arrays, *(str(prim.GetAttribute(name).Get(time)) for name in _TOKENS))
 
 
 def _sizes(places: list[F64], shape: Shape) -> Iterator[tuple[float, F64]]:

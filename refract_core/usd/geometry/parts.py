@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -11,9 +12,14 @@ from pxr import Usd, UsdGeom, UsdShade
 
 from ...scene import F32, I32, Material, Notice, Texture
 from ..materials.read import display_color_material, read_material
+from .cages import FINENESS, is_subdivided, surface_size
 from .primvars import as_values, read_primvar, spread
+from .refined import Fineness
 from .shapes import Shape
-from .traverse import some_of
+from .traverse import Placement, some_of
+
+MOST_IN_ALL = 8_000_000
+"""Triangles that the subdivision surfaces of a stage have together, counted wherever they are drawn."""
 
 
 @dataclass
@@ -23,6 +29,8 @@ class Tables:
     time: Usd.TimeCode
     metres_per_unit: float
     notices: list[Notice]
+    fineness: Fineness = FINENESS["low"]
+    """Of subdivision surfaces"""
     textures: dict[str, Texture] = field(default_factory=dict)
     materials: list[Material] = field(default_factory=list)
     numbers: dict[tuple[str, bool], int] = field(default_factory=dict)
@@ -50,6 +58,18 @@ class Part(NamedTuple):
     """name -> (T, 3, D), or (1, 1, D) where constant"""
     wanted: frozenset[str]
     """Names its materials read, whether it has them or not."""
+
+
+def affordable(placements: Sequence[Placement], time: Usd.TimeCode, fineness: Fineness) -> Fineness:
+    """As fine as subdivision surfaces may be for all of a stage to have `MOST_IN_ALL` triangles of them."""
+    drawn = Counter(placement.prim.GetPath() for placement in placements)
+    prims = {placement.prim.GetPath(): placement.prim for placement in placements}
+    meshes = [(UsdGeom.Mesh(prim), drawn[path]) for path, prim in prims.items() if is_subdivided(prim, time)]
+    for steps in range(fineness.steps, 0, -1):
+        fewer = fineness._replace(steps=steps)
+        if sum(times * surface_size(mesh, time, fewer) for mesh, times in meshes) <= MOST_IN_ALL:
+            return fewer
+    return fineness._replace(steps=0)
 
 
 def bind(prims: Sequence[Usd.Prim], notices: list[Notice]) -> list[Bound]:

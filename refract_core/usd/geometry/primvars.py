@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pxr import Usd, UsdGeom, Vt
 
 from ...scene import F32, Notice
+from .refined import Refinement
 from .triangulate import Index, turned_over
 
 CHANNELS = 4
@@ -19,14 +20,17 @@ class Topology(NamedTuple):
     """Where the corners of the triangles come from, so that a value of any interpolation finds them."""
 
     corners: Index
-    """shape (T, 3): place in the prim's face corners"""
+    """shape (T, 3): place in the prim's face corners; with a refinement, in those of its last level"""
     vertices: Index
-    """shape (T, 3): place in the prim's points"""
+    """shape (T, 3): place in the prim's points; with a refinement, in those of its last level, which begin with them"""
     faces: Index
     """shape (T,): place in the prim's faces"""
     corner_count: int
+    """of the prim, as the next two"""
     point_count: int
     face_count: int
+    refinement: Refinement | None = None
+    """Of a subdivision surface"""
 
     def turned_over(self) -> Topology:
         """The same of triangles whose last two corners have changed places."""
@@ -81,6 +85,9 @@ def to_corners(values: F32, picks: Index | None, interpolation: str, topology: T
     places, expected = _places(interpolation, topology)
     if count != expected:
         raise Unusable(f"it is {interpolation}, which takes {expected} values here, but has {count}")
+    if topology.refinement is not None and interpolation != UsdGeom.Tokens.uniform:
+        refined, of_corner = topology.refinement.corners(values if picks is None else values[picks], interpolation)
+        return Corners(refined, of_corner[topology.corners])
     return Corners(values, places if picks is None else picks[places])
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +13,36 @@ from pxr import Usd, UsdGeom
 from ...scene import F32, F64, U32, Notice
 from ...world.solid import looks_inwards
 from . import gprims
+from .cages import (
+    FINENESS,
+    SUBDIVISION_ATTRIBUTES,
+    Loops,
+    cut_for_loop,
+    integers,
+    is_subdivided,
+    read_cage,
+    steps_of,
+    without_repeats,
+)  # fmt: skip
 from .primvars import Corners, Topology, Unusable, as_values, evaluate, to_corners
-from .triangulate import Index, Triangles, fans, fans_fit, is_closed, smooth_normals, triangulate, turned_over
+from .refined import Fineness, surface
+from .triangulate import (
+    Index,
+    Triangles,
+    fans,
+    fans_fit,
+    has_area,
+    is_closed,
+    smooth_normals,
+    triangulate,
+    turned_over,
+)  # fmt: skip
 
-SUBDIVIDED = (UsdGeom.Tokens.catmullClark, UsdGeom.Tokens.loop)
 INWARDS = "the mesh is closed but its faces look inwards"
 TURN = "turn its orientation attribute round, or reverse its faces"
 """What to do about it."""
 _MESH_ATTRIBUTES = ("points", "faceVertexCounts", "faceVertexIndices", "holeIndices", "normals")
+_HIDDEN = ", or touch a boundary and interpolateBoundary is none, or have no area"
 _LARGEST = 1.0e15
 """Coordinates beyond it are taken for garbage: their squares still fit float32."""
 _IDENTITY = np.eye(4)
@@ -51,7 +73,11 @@ class Shape:
     is_sphere: bool = False
     """Shape space holds the unit sphere about the origin."""
     cage: bool = False
-    """The control cage of a subdivision surface."""
+    """The control cage of a subdivision surface, which would have too many triangles."""
+    subdivided: bool = False
+    """A subdivision surface, on its limit."""
+    coarse: bool = False
+    """A subdivision surface that took fewer steps than it was asked to."""
     inside_out: bool = False
     """Its faces looked inwards before they were turned; see `outwards`."""
 
@@ -82,11 +108,21 @@ class Shape:
         return replace(self, triangles=triangles, normals=normals, topology=topology, inside_out=True)
 
 
-def read_shape(prim: Usd.Prim, time: Usd.TimeCode, notices: list[Notice]) -> Shape | None:
-    """Triangles of a Mesh or gprim at a time; None, with a notice that says why, where nothing is left to draw."""
-    is_mesh = prim.GetTypeName() == "Mesh"
+def read_shape(
+    prim: Usd.Prim, time: Usd.TimeCode, notices: list[Notice], fineness: Fineness = FINENESS["low"]
+) -> Shape | None:
+    """Triangles of a Mesh or gprim at a time; None, with a notice that says why, where nothing is left to draw.
+
+    Args:
+        fineness: of subdivision surfaces
+    """
     try:
-        shape = _read_mesh(UsdGeom.Mesh(prim), time, notices) if is_mesh else _read_gprim(prim, time)
+        if prim.GetTypeName() != "Mesh":
+            shape = _read_gprim(prim, time)
+        elif is_subdivided(prim, time):
+            shape = _read_surface(UsdGeom.Mesh(prim), time, notices, fineness)
+        else:
+            shape = _read_mesh(UsdGeom.Mesh(prim), time, notices)
     except Unusable as reason:
         notices.append(Notice(str(prim.GetPath()), f"skipped: {reason}"))
         return None
@@ -132,6 +168,8 @@ class _Faces:
     """What was left out, and how many"""
     known: _Topology | None = None
     """What was found out already about a mesh of the same topology"""
+    holes: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
+    """shape (total,): faces that are not drawn but shape the surface around them; of subdivision surfaces alone"""
 
 
 class _Topology(NamedTuple):
@@ -166,8 +204,12 @@ def _topology(count_bytes: bytes, index_bytes: bytes) -> _Topology | None:
     return _Topology(counts, indices, starts, np.arange(len(counts)), cut, indices[cut.corners], loops, used, closed)
 
 
-def _read_mesh(mesh: UsdGeom.Mesh, time: Usd.TimeCode, notices: list[Notice]) -> Shape:
-    """A Mesh as triangles; faces that cannot be used are left out with a notice."""
+def _read_mesh(mesh: UsdGeom.Mesh, time: Usd.TimeCode, notices: list[Notice], *, cage: bool = False) -> Shape:
+    """A Mesh as triangles; faces that cannot be used are left out with a notice.
+
+    Args:
+        cage: of a surface that is too large to be subdivided; it has smooth normals
+    """
     faces = _usable_faces(mesh, time)
     cut = _cut(faces, str(mesh.GetPath()), notices)
     left_handed = mesh.GetOrientationAttr().Get(time) == UsdGeom.Tokens.leftHanded
@@ -180,7 +222,6 @@ def _read_mesh(mesh: UsdGeom.Mesh, time: Usd.TimeCode, notices: list[Notice]) ->
         vertices = faces.indices[corners]
         points, triangles = _compact(faces.points, vertices)
     topology = Topology(corners, vertices, cut.faces, faces.corner_total, len(faces.points), faces.total)
-    cage = mesh.GetSubdivisionSchemeAttr().Get(time) in SUBDIVIDED
     if cage:
         normals: Corners | None = Corners(smooth_normals(points, triangles), triangles)
     else:
@@ -198,6 +239,58 @@ def _read_mesh(mesh: UsdGeom.Mesh, time: Usd.TimeCode, notices: list[Notice]) ->
     )
 
 
+def _read_surface(mesh: UsdGeom.Mesh, time: Usd.TimeCode, notices: list[Notice], fineness: Fineness) -> Shape:
+    """A subdivision surface as triangles on its limit; its cage, where even one step would make too many.
+
+    Raises:
+        Unusable: nothing of it is left to draw.
+    """
+    path = str(mesh.GetPath())
+    faces = _usable_faces(mesh, time, surface=True)
+    faults = dict(faces.faults)
+    loops = without_repeats(Loops(faces.indices, faces.starts, faces.counts, faces.faces), faults)
+    loops = cut_for_loop(mesh, time, faces.points, loops, notices)
+    if not len(loops.counts):
+        raise Unusable(_nothing(faces, faults))
+    cage = read_cage(mesh, time, loops, len(faces.points), notices)
+    steps = steps_of(cage, fineness)
+    if steps < 0:
+        return _read_mesh(mesh, time, notices, cage=True)
+    made = surface(faces.points, cage, faces.holes[loops.faces], steps)
+    if made.lost:
+        notices.append(Notice(path, f"{made.lost} of its creases are ignored: they run along no edge"))
+    last = made.refinement.last
+    points, normals = made.points.astype(np.float32), made.normals.astype(np.float32)
+    corners = made.corners[has_area(points, last.vertices[made.corners])]
+    if not len(corners):
+        raise Unusable(_nothing(faces, faults) + ("" if faults else _HIDDEN))
+    if faults:
+        notices.append(Notice(path, _left_out(faces, faults)))
+    if mesh.GetOrientationAttr().Get(time) == UsdGeom.Tokens.leftHanded:
+        corners, normals = turned_over(corners), -normals
+    vertices = last.vertices[corners]
+    used, triangles = _compact(points, vertices)
+    of_triangle = loops.faces[last.root[last.owner[corners[:, 0]]]]
+    size = faces.corner_total, len(faces.points), faces.total
+    return Shape(
+        points=used,
+        triangles=np.ascontiguousarray(triangles, np.uint32),
+        normals=_mended(Corners(normals, corners), used, triangles),
+        topology=Topology(corners, vertices, of_triangle, *size, made.refinement),
+        closed=_closes(made.corners, last.vertices, points),
+        double_sided=bool(mesh.GetDoubleSidedAttr().Get(time)),
+        varying=_varies(mesh.GetPrim(), (*_MESH_ATTRIBUTES, *SUBDIVISION_ATTRIBUTES)),
+        subdivided=True,
+        coarse=steps < fineness.steps,
+    )
+
+
+def _closes(corners: Index, vertices: Index, points: F32) -> bool:
+    """Whether triangles close a volume; corners as shape (T, 3)."""
+    flat = corners.ravel()
+    return is_closed(points, vertices[flat], np.arange(len(corners)) * 3, np.full(len(corners), 3))
+
+
 def _cut(faces: _Faces, path: str, notices: list[Notice]) -> Triangles:
     """Triangles with an area, and one notice about everything that is not drawn.
 
@@ -211,34 +304,41 @@ def _cut(faces: _Faces, path: str, notices: list[Notice]) -> Triangles:
     faults = dict(faces.faults)
     if flat := int((~drawn).sum()):
         faults["faces without area"] = flat
-    listed = ", ".join(f"{count} {what}" for what, count in faults.items()) or "all are holes"
     if not len(cut.faces):
-        raise Unusable(f"none of its {faces.total} faces can be drawn: {listed}")
+        raise Unusable(_nothing(faces, faults))
     if faults:
-        text = f"not everything in its {faces.total} faces can be used; left out: {listed}"
-        notices.append(Notice(path, text))
+        notices.append(Notice(path, _left_out(faces, faults)))
     return cut
 
 
-def _integers(value: Any) -> Index:
-    return np.zeros(0, np.int64) if value is None else np.asarray(value, np.int64)
+def _nothing(faces: _Faces, faults: dict[str, int]) -> str:
+    listed = ", ".join(f"{count} {what}" for what, count in faults.items()) or "all are holes"
+    return f"none of its {faces.total} faces can be drawn: {listed}"
 
 
-def _usable_faces(mesh: UsdGeom.Mesh, time: Usd.TimeCode) -> _Faces:
+def _left_out(faces: _Faces, faults: dict[str, int]) -> str:
+    listed = ", ".join(f"{count} {what}" for what, count in faults.items())
+    return f"not everything in its {faces.total} faces can be used; left out: {listed}"
+
+
+def _usable_faces(mesh: UsdGeom.Mesh, time: Usd.TimeCode, *, surface: bool = False) -> _Faces:
     """Reads the topology and leaves out what cannot be drawn.
+
+    Args:
+        surface: keeps holes as faces, and says which they are
 
     Raises:
         Unusable: where there are no points or faces, or a count is negative, so that no face can be told from another.
     """
     values = as_values(mesh.GetPointsAttr().Get(time))
-    counts = _integers(mesh.GetFaceVertexCountsAttr().Get(time))
-    indices = _integers(mesh.GetFaceVertexIndicesAttr().Get(time))
+    counts = integers(mesh.GetFaceVertexCountsAttr().Get(time))
+    indices = integers(mesh.GetFaceVertexIndicesAttr().Get(time))
     if values is None or not len(values) or values.shape[1] != 3:
         raise Unusable("it has no points at this time")
     if not len(counts):
         raise Unusable("it has no faces at this time")
-    holes = _integers(mesh.GetHoleIndicesAttr().Get(time))
-    if len(indices) <= _SMALL and not len(holes):
+    holes = integers(mesh.GetHoleIndicesAttr().Get(time))
+    if len(indices) <= _SMALL and not len(holes) and not surface:
         known = _topology(counts.tobytes(), indices.tobytes())
         if known is not None and known.used == len(values) and _tame(values):
             shared = known.indices, known.starts, known.counts, known.faces
@@ -248,7 +348,8 @@ def _usable_faces(mesh: UsdGeom.Mesh, time: Usd.TimeCode) -> _Faces:
     ends = np.cumsum(counts)
     starts = ends - counts
     if counts.min() >= 3 and ends[-1] == len(indices) and not len(holes) and _sound(values, indices):
-        return _Faces(values, indices, starts, counts, np.arange(len(counts)), len(counts), len(indices), {})
+        every, none = np.arange(len(counts)), np.zeros(len(counts), bool)
+        return _Faces(values, indices, starts, counts, every, len(counts), len(indices), {}, None, none)
     faults: dict[str, int] = {}
     usable = np.ones(len(counts), bool)
     _exclude(usable, counts >= 3, "faces with fewer than 3 vertices", faults)
@@ -266,9 +367,13 @@ def _usable_faces(mesh: UsdGeom.Mesh, time: Usd.TimeCode) -> _Faces:
     named = (holes >= 0) & (holes < len(counts))
     if not named.all():
         faults["holeIndices that name no face"] = int((~named).sum())
-    usable[holes[named]] = False
+    hidden = np.zeros(len(counts), bool)
+    hidden[holes[named]] = True
+    if not surface:
+        usable &= ~hidden
     faces = np.flatnonzero(usable)
-    return _Faces(values, indices, starts[faces], counts[faces], faces, len(counts), len(indices), faults)
+    kept = starts[faces], counts[faces], faces
+    return _Faces(values, indices, *kept, len(counts), len(indices), faults, None, hidden)
 
 
 def _sound(points: F32, indices: Index) -> bool:

@@ -14,6 +14,8 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from ...scene import F64, Notice
+from ..geometry.primvars import Topology
+from ..geometry.triangulate import Index
 from ..layers.write import apply_api
 from ..materials.read import THICKNESS_PRIMVAR
 from .find import Body, Coat
@@ -66,12 +68,31 @@ def spread_values(body: Body, values: F64) -> tuple[str, F64]:
     assert body.topology is not None
     at = values[:, [0, 2, 1]] if body.mirrored else values
     points, corners = body.topology.vertices, body.topology.corners
+    if body.topology.refinement is not None:
+        return _spread_to_cage(body.topology, body.topology.refinement.cage_corners[corners], at)
     of_point = np.full(body.topology.point_count, at.mean())  # what no triangle uses is not drawn
     of_point[points.ravel()] = at.ravel()
     if np.abs(of_point[points] - at).max() <= _AGREE * at.max():
         return str(UsdGeom.Tokens.vertex), of_point
     of_corner = np.full(body.topology.corner_count, at.mean())
     of_corner[corners.ravel()] = at.ravel()
+    return str(UsdGeom.Tokens.faceVarying), of_corner
+
+
+def _spread_to_cage(topology: Topology, corners: Index, at: F64) -> tuple[str, F64]:
+    """The same for a subdivision surface: what its cage can carry, linear in between.
+
+    Args:
+        corners: shape (T, 3): the prim's face corner that each triangle corner stands at; -1: at none
+    """
+    rows = corners >= 0
+    points = topology.vertices[rows]
+    of_point = np.full(topology.point_count, at.mean())
+    of_point[points] = at[rows]
+    if np.abs(of_point[points] - at[rows]).max() <= _AGREE * at.max():
+        return str(UsdGeom.Tokens.varying), of_point
+    of_corner = np.full(topology.corner_count, at.mean())
+    of_corner[corners[rows]] = at[rows]
     return str(UsdGeom.Tokens.faceVarying), of_corner
 
 
