@@ -146,8 +146,8 @@ Complexity = Annotated[
     str,
     typer.Option(
         metavar="low|medium|high|veryhigh",
-        help="How fine subdivision surfaces are: every face of a cage becomes 4 x 4 quads with low, 8 x 8, 16 x 16, "
-        "and 32 x 32 with veryhigh, all on the limit surface; fewer where a cage is dense.",
+        help="How fine subdivision surfaces are: a face of a cage becomes 4 x 4 quads with low, 8 x 8, 16 x 16, and "
+        "32 x 32 with veryhigh, all on the limit surface; more where a cage has few faces, fewer where many.",
     ),
 ]
 ColorCorrection = Annotated[

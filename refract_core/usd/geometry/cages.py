@@ -18,8 +18,8 @@ SUBDIVISION_ATTRIBUTES = (
 )  # fmt: skip
 """What a subdivision surface depends on beside what every mesh does."""
 FINENESS = {
-    "low": Fineness(2, 1 << 17), "medium": Fineness(3, 1 << 18), "high": Fineness(4, 1 << 19),
-    "veryhigh": Fineness(5, MOST_TRIANGLES),
+    "low": Fineness(2, 1 << 17, 1 << 11), "medium": Fineness(3, 1 << 18, 1 << 13),
+    "high": Fineness(4, 1 << 19, 1 << 15), "veryhigh": Fineness(5, MOST_TRIANGLES, 1 << 17),
 }  # fmt: skip
 """By complexity. A dense cage is smooth as it is: where it has many faces, fewer steps will do."""
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...scene import F64
-from .subdivision import INFINITE, Flags, Level, Scheme, fans, loop_beta, worn
+from .subdivision import INFINITE, Flags, Level, Scheme, loop_beta, worn
 from .triangulate import Index
 
 _STEPS = 24
@@ -62,7 +62,7 @@ def limit_surface(level: Level, values: F64) -> tuple[F64, F64]:
 
 def _limit(level: Level, values: F64, normals: F64 | None) -> F64:
     found = values.copy()
-    around = fans(level)
+    around = level.fans
     kinds = 2 * around.sizes + around.closed
     for kind in np.unique(kinds).tolist():
         some = np.flatnonzero(kinds == kind)

@@ -18,7 +18,7 @@ from .refined import Fineness
 from .shapes import Shape
 from .traverse import Placement, some_of
 
-MOST_IN_ALL = 8_000_000
+MOST_IN_ALL = 4_000_000
 """Triangles that the subdivision surfaces of a stage have together, counted wherever they are drawn."""
 
 
@@ -65,11 +65,11 @@ def affordable(placements: Sequence[Placement], time: Usd.TimeCode, fineness: Fi
     drawn = Counter(placement.prim.GetPath() for placement in placements)
     prims = {placement.prim.GetPath(): placement.prim for placement in placements}
     meshes = [(UsdGeom.Mesh(prim), drawn[path]) for path, prim in prims.items() if is_subdivided(prim, time)]
-    for steps in range(fineness.steps, 0, -1):
-        fewer = fineness._replace(steps=steps)
+    plain = [fineness._replace(steps=steps, few=0) for steps in range(fineness.steps, 0, -1)]
+    for fewer in (fineness, *plain):
         if sum(times * surface_size(mesh, time, fewer) for mesh, times in meshes) <= MOST_IN_ALL:
             return fewer
-    return fineness._replace(steps=0)
+    return fineness._replace(steps=0, few=0)
 
 
 def bind(prims: Sequence[Usd.Prim], notices: list[Notice]) -> list[Bound]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,9 @@ from .triangulate import Index
 
 MOST_TRIANGLES = 2_000_000
 """Of one mesh; a cage that a single step takes beyond it is drawn as it is."""
-_NO_PAIRS = np.zeros((0, 2), np.int64), np.zeros(0)
+MORE_STEPS = 2
+_SMALL = 512
+"""Corners of a cage up to which its topology is kept."""
 
 
 class Fineness(NamedTuple):
@@ -25,6 +27,8 @@ class Fineness(NamedTuple):
     """Every step makes four faces of one; limit positions come after the last."""
     triangles: int
     """Of one mesh, beyond which fewer steps are taken"""
+    few: int = 0
+    """Of one mesh, under which up to `MORE_STEPS` more are taken: a face of a cube is a large part of its outline"""
 
 
 class Edges(NamedTuple):
@@ -62,6 +66,8 @@ def steps_for(cage_faces: int, cage_corners: int, quads: bool, scheme: Scheme, f
     """
     least = 0 if quads or scheme is Scheme.LOOP else 1
     steps = max(fineness.steps, least)
+    for _ in range(MORE_STEPS):
+        steps += triangles_after(cage_faces, cage_corners, scheme, steps) < fineness.few
     while steps > least and triangles_after(cage_faces, cage_corners, scheme, steps) > fineness.triangles:
         steps -= 1
     return steps if triangles_after(cage_faces, cage_corners, scheme, steps) <= MOST_TRIANGLES else -1
@@ -191,38 +197,74 @@ class Surface(NamedTuple):
     refinement: Refinement
     lost: int
     """Creases that run along no edge"""
+    closed: bool
+    """By topology alone"""
 
 
-def surface(points: F32, cage: Cage, hidden: Flags, steps: int) -> Surface:
+def surface(points: F32, cage: Cage, holes: Flags, steps: int) -> Surface:
     """The limit of a cage after so many steps.
 
     Args:
         points: shape (V, 3), finite where they are used
-        hidden: shape (F,): faces that are part of the surface but not drawn
+        holes: shape (F,): faces that are part of the surface but not drawn
     """
-    base, lost = base_level(
-        cage.scheme, len(points), cage.indices, cage.counts, *cage.edges, smooth_triangles=cage.smooth_triangles
-    )
-    edge_points = np.zeros(base.points, bool)
-    edge_points[base.ends[np.bincount(base.edge, minlength=len(base.ends)) == 1].ravel()] = True
-    if cage.boundary == "edgeAndCorner":
-        base.sharpness[edge_points & (base.faces_at == 1)] = INFINITE
-    elif cage.boundary == "none":
-        hidden = hidden.copy()
-        hidden[base.owner[edge_points[base.vertices]]] = True
-    stack = tuple(levels(base, steps))
+    stack, lost = _stack_of(cage, len(points), steps)
     exact = points.astype(np.float64)
     exact[~np.isfinite(exact)] = 0.0  # of points that no face uses
     for level in stack[:-1]:
         exact = refine(level, exact)
     last = stack[-1]
     at, normals = limit_surface(last, exact)
+    hidden = holes | _boundary_faces(stack[0]) if cage.boundary == "none" else holes
     drawn = np.flatnonzero(~hidden[last.root])
     if last.scheme is Scheme.LOOP:
         corners = 3 * drawn[:, None] + np.arange(3)
     else:
         corners = (4 * drawn[:, None] + np.array([0, 1, 2, 0, 2, 3])).reshape(-1, 3)
-    return Surface(at, _mended(last, at, normals), corners, Refinement(cage, stack), lost)
+    closed = bool((stack[0].mate >= 0).all()) and not hidden.any()
+    return Surface(at, _mended(last, at, normals), corners, Refinement(cage, stack), lost, closed)
+
+
+def _stack_of(cage: Cage, points: int, steps: int) -> tuple[tuple[Level, ...], int]:
+    """The cage's topology and that of each step; those of small cages are kept, for many are the same few shapes."""
+    if len(cage.indices) > _SMALL:
+        return _make_stack(cage, points, steps)
+    arrays = cage.indices, cage.counts, *cage.edges.creases, *cage.edges.corners
+    rules = cage.scheme, cage.boundary, cage.smooth_triangles
+    return _kept_stack(tuple(array.tobytes() for array in arrays), *rules, points, steps)
+
+
+@lru_cache(maxsize=32)
+def _kept_stack(
+    arrays: tuple[bytes, ...], scheme: Scheme, boundary: str, smooth_triangles: bool, points: int, steps: int
+) -> tuple[tuple[Level, ...], int]:
+    indices, counts, pairs, corners = (np.frombuffer(arrays[place], np.int64) for place in (0, 1, 2, 4))
+    sharp, pinned = (np.frombuffer(arrays[place], np.float64) for place in (3, 5))
+    edges = Edges((pairs.reshape(-1, 2), sharp), (corners, pinned))
+    return _make_stack(Cage(scheme, indices, counts, indices, edges, boundary, "", smooth_triangles), points, steps)
+
+
+def _make_stack(cage: Cage, points: int, steps: int) -> tuple[tuple[Level, ...], int]:
+    base, lost = base_level(
+        cage.scheme, points, cage.indices, cage.counts, *cage.edges, smooth_triangles=cage.smooth_triangles
+    )
+    if cage.boundary == "edgeAndCorner":
+        base.sharpness[_on_boundary(base) & (base.faces_at == 1)] = INFINITE
+    return tuple(levels(base, steps)), lost
+
+
+def _on_boundary(base: Level) -> Flags:
+    """Points at an edge of one face, shape (V,)."""
+    found = np.zeros(base.points, bool)
+    found[base.ends[np.bincount(base.edge, minlength=len(base.ends)) == 1].ravel()] = True
+    return found
+
+
+def _boundary_faces(base: Level) -> Flags:
+    """Faces with a point on a boundary, shape (F,)."""
+    found = np.zeros(base.faces, bool)
+    found[base.owner[_on_boundary(base)[base.vertices]]] = True
+    return found
 
 
 def _mended(level: Level, at: F64, normals: F64) -> F64:

@@ -109,6 +109,10 @@ class Level:
     def rules(self) -> _Rules:
         return _rules(self)
 
+    @cached_property
+    def fans(self) -> Fans:
+        return _fans(self)
+
 
 class _Rules(NamedTuple):
     """Weights of one step for points; rows of `points` count in `at_creases` and `ends` only."""
@@ -178,7 +182,7 @@ def base_level(
     crowded = np.bincount(edge, minlength=len(keys)) > 2
     crowded |= (np.bincount(edge[found.mate < 0], minlength=len(keys)) == 2)
     sharpness[pairs[crowded].ravel()] = INFINITE
-    sharpness[np.bincount(fans(found).points, minlength=points) > 1] = INFINITE
+    sharpness[np.bincount(found.fans.points, minlength=points) > 1] = INFINITE
     return found, int((~known).sum())
 
 
@@ -206,7 +210,7 @@ class Fans(NamedTuple):
     """shape (C,): the corner at the same point on the next face, -1: none"""
 
 
-def fans(level: Level) -> Fans:
+def _fans(level: Level) -> Fans:
     """The fans of all points; each corner is in one."""
     after = level.mate[level.preceding]
     fresh = np.ones(len(after), bool)
