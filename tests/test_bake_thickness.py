@@ -66,6 +66,20 @@ def test_the_wall_of_a_hollow_body_and_the_models_path_along_refracted_rays(tmp_
     assert rows["Ball"].most == pytest.approx(2.0, rel=2e-3)
 
 
+@pytest.mark.parametrize("scheme", ["catmullClark", "loop"])
+def test_a_subdivision_surface_carries_values_at_the_points_of_its_cage(tmp_path: Path, scheme: str) -> None:
+    stage = new(tmp_path / "in.usda")
+    mesh(stage, "/W/Ball", ball(1.0, count=2), glass(stage)).GetSubdivisionSchemeAttr().Set(scheme)
+    stage.Save()
+    rows, _ = run(tmp_path / "in.usda", tmp_path / "out.usda")
+    assert rows["Ball"].how == "varying"
+    scene = load_stage(tmp_path / "out.usda")
+    found, _ = drawn(scene, "Ball")
+    radius = np.linalg.norm(found.points - found.points.mean(axis=0), axis=1).mean()
+    assert radius < 0.99  # it lies inside of its cage
+    np.testing.assert_allclose(metres(scene, "Ball"), 2.0 * radius, rtol=3e-2)
+
+
 def test_gprims_carry_one_value(tmp_path: Path) -> None:
     stage = new(tmp_path / "in.usda", unit=0.01)
     material = glass(stage)

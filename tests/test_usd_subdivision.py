@@ -576,6 +576,16 @@ def test_face_varying_of_one_chart_is_as_smooth_as_the_surface() -> None:
     assert found == pytest.approx(at, abs=1e-5)
 
 
+def test_values_that_are_no_numbers_stay_alone() -> None:
+    points, faces = grid(6)
+    values = [(1.0, 1.0, 1.0)] * 48 + [(float("nan"), 1.0, 1.0)]
+    scene, mesh, _ = surface(points, faces, extra=primvar("displayColor", "color3f", values, "vertex"))
+    assert "has 1 values that are NaN" in texts(scene, "/M")
+    found = mesh.primvars["displayColor"][..., 0]
+    assert np.isfinite(found).all()
+    assert (found > 0.999).mean() > 0.8
+
+
 def test_materials_of_faces_go_to_what_they_become() -> None:
     points, faces = random_cage(9)
     chosen = [1, 4, 6]

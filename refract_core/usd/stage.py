@@ -356,7 +356,7 @@ def _part(prim: Usd.Prim, bound: Bound, shapes: dict[Sdf.Path, Shape | None], ta
         if shared:
             shapes[key] = shape
         part = assemble(prim, shape, bound, tables) if shape is not None else None
-        if part is not None and part.shape.subdivided:  # what it is made of is far larger than it is
+        if part is not None and part.shape.subdivided and not shared:  # what it was made of is larger than it is
             part = part._replace(shape=replace(part.shape, topology=None))
         return part
     except Tf.ErrorException as error:

@@ -20,6 +20,8 @@ _STEPS = 24
 """Steps at corners, until float32 no longer tells the difference."""
 _ENDLESS = 400
 """Steps of weights, which have no rounding to lose."""
+_WIDE = 64
+"""Faces at a point beyond which one crease among its edges is overlooked, as the weights would be a large matrix."""
 
 
 class _Rings(NamedTuple):
@@ -195,6 +197,8 @@ def _ended(scheme: Scheme, rings: _Rings, normals: F64 | None) -> F64:
     """Points inside of a surface where an endless crease ends. A step is its own mirror picture in the crease: what is
     odd there does not know of it; of what is even, steps without end leave one combination."""
     n = rings.corners.shape[1]
+    if n > _WIDE:
+        return _smooth(scheme, rings, normals)
     begin = np.argmax(rings.sharp > 0.0, axis=1)
     order = (begin[:, None] + np.arange(n)) % n
     spokes = np.take_along_axis(rings.spokes, order[:, :, None], axis=1)

@@ -86,7 +86,9 @@ def to_corners(values: F32, picks: Index | None, interpolation: str, topology: T
     if count != expected:
         raise Unusable(f"it is {interpolation}, which takes {expected} values here, but has {count}")
     if topology.refinement is not None and interpolation != UsdGeom.Tokens.uniform:
-        refined, of_corner = topology.refinement.corners(values if picks is None else values[picks], interpolation)
+        flat = values if picks is None else values[picks]
+        flat = np.where(np.isfinite(flat), flat, np.float32(0.0))  # one that is no number would reach its neighbours
+        refined, of_corner = topology.refinement.corners(flat, interpolation)
         return Corners(refined, of_corner[topology.corners])
     return Corners(values, places if picks is None else picks[places])
 
@@ -147,12 +149,14 @@ def read_primvar(
     if primvar.GetInterpolation() == UsdGeom.Tokens.constant and (count := _authored(primvar, time)) > 1:
         text = f"primvars:{name} is constant, which takes one value, but has {count}; the first is used"
         notices.append(Notice(str(prim.GetPath()), text))
-    finite = np.isfinite(corners.values)
+    refined = topology is not None and topology.refinement is not None
+    authored = as_values(primvar.Get(time)) if refined else corners.values
+    finite = np.isfinite(corners.values if authored is None else authored)
     if finite.all():
         return corners
     text = f"primvars:{name} has {int((~finite).sum())} values that are NaN or infinite; 0 is used in their place"
     notices.append(Notice(str(prim.GetPath()), text))
-    return corners._replace(values=np.where(finite, corners.values, np.float32(0.0)))
+    return corners._replace(values=np.where(np.isfinite(corners.values), corners.values, np.float32(0.0)))
 
 
 def _authored(primvar: UsdGeom.Primvar, time: Usd.TimeCode) -> int:
