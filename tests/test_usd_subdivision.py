@@ -320,6 +320,85 @@ def test_normals_are_those_of_the_surface(scheme: str) -> None:
     assert worst[1] < 6
 
 
+def zoomed(net: Net, i: int, loop: bool) -> tuple[F64, F64]:
+    """Where the written rules take a point in the end, and the normals of the faces around it there, in their order.
+
+    A ring needs nothing but itself. What is far away is left behind, what is left is made as large as before."""
+    origin, scale = np.zeros(3, np.longdouble), np.longdouble(1.0)
+    net = Net([p.astype(np.longdouble) for p in net.points], net.faces, net.sharp, net.pinned)
+    for _ in range(40):
+        net = rules.finer(Net(net.points, [face for face in net.faces if i in face], net.sharp, net.pinned), loop)
+        net.faces = [face for face in net.faces if i in face]
+        used = sorted({j for face in net.faces for j in face} - {i})
+        number = {i: 0} | {j: k + 1 for k, j in enumerate(used)}
+        here = net.points[i]
+        size = max(np.abs(net.points[j] - here).max() for j in used)
+        origin, scale = origin + scale * here, scale * size
+        net = Net(
+            [(net.points[j] - here) / size for j in (i, *used)],
+            [[number[j] for j in face] for face in net.faces],
+            {frozenset(number[j] for j in edge): sharp for edge, sharp in net.sharp.items() if edge <= number.keys()},
+            {0: net.pinned.get(i, 0.0)},
+        )
+        i = 0
+    turned_round = [face[face.index(0) :] + face[: face.index(0)] for face in net.faces]
+    normals = np.array([np.cross(net.points[face[1]], net.points[face[-1]]) for face in turned_round])
+    normals /= np.sqrt((normals**2).sum(axis=1, keepdims=True))
+    return origin.astype(np.float64), normals.astype(np.float64)
+
+
+@pytest.mark.parametrize("loop", [False, True])
+@pytest.mark.parametrize("seed", range(6))
+def test_normals_and_positions_where_creases_run_and_end(seed: int, loop: bool) -> None:
+    """By the written rules, forty steps deep, for each face at each point of the cage."""
+    rng = np.random.default_rng(100 + seed)
+    points, faces = random_cage(seed, triangles=loop)
+    if not loop:  # quads alone, so that a ring is one from the start
+        net = rules.finer(net_of(points, faces))
+        points, faces = np.array(net.points), net.faces
+    if seed % 3 == 2:
+        faces = faces[: len(faces) * 3 // 4]
+    edges = [sorted(edge) for edge in net_of(points, faces).edges()]
+    picked = rng.choice(len(edges), len(edges) // 6, replace=False)
+    creases: list[Crease] = [(edges[k], float(rng.choice([0.6, 1.5, 10, 10]))) for k in picked]
+    text = primvar("displayColor", "color3f", [(float(k), 0.0, 0.0) for k in range(len(faces))], "uniform")
+    text += 'uniform token interpolateBoundary = "edgeOnly"'
+    how: dict[str, Any] = {"scheme": "loop" if loop else "catmullClark", "creases": creases}
+    _, mesh, found = surface(points, faces, extra=text, **how)
+    net = net_of(points.astype(np.float32), faces, creases)
+    used = sorted({i for face in faces for i in face})
+    assert mesh.normals is not None
+    owner = np.broadcast_to(mesh.primvars["displayColor"][..., 0], mesh.triangles.shape).astype(int)
+    touched = set(touching(net))
+    kinds = Counter[str]()
+    for place, i in enumerate(used):
+        mine = {edge: beside for edge, beside in net.edges().items() if i in edge}
+        endless = sum(len(beside) == 1 or net.sharp.get(edge, 0) >= 10 for edge, beside in mine.items())
+        around = [k for k, face in enumerate(faces) if i in face]
+        if i in touched or endless > 2 or len(around) < 3 or len(around) > 7:
+            continue
+        position, normals = zoomed(net, i, loop)
+        assert found[place] == pytest.approx(position, abs=2e-6), i
+        if endless == 2 and len(mine) > len(around) > 3:
+            continue  # the rules themselves are slow to settle there
+        kinds[("smooth", "end", "crease")[endless]] += 1
+        for face, normal in zip(around, normals, strict=True):
+            ours = mesh.normals[(mesh.triangles == place) & (owner == face)]
+            assert ours @ normal == pytest.approx(1.0, abs=2e-4), (i, face, endless)
+    assert kinds["smooth"] > 2
+    assert kinds["end"] + kinds["crease"] > 3
+
+
+def test_the_tip_of_a_cone_has_a_normal_for_each_face() -> None:
+    points, faces = solid("cube")
+    _, mesh, _ = surface(points, faces, corners={7: 10.0})
+    assert mesh.normals is not None
+    at_tip = np.unique(mesh.normals[mesh.triangles == 7].round(5), axis=0)
+    assert len(at_tip) == 3
+    turned_once = np.roll(at_tip, 1, axis=1)  # the cube is its own picture when x becomes y, y z and z x
+    assert cKDTree(at_tip).query(turned_once)[0].max() < 1e-4
+
+
 def test_smooth_surfaces_have_one_normal_at_each_point() -> None:
     points, faces = random_cage(4)
     _, mesh, _ = surface(points, faces, creases=[(faces[0][:2], 3.0)])
@@ -564,6 +643,46 @@ def test_face_varying_values(rule: str, indexed: bool) -> None:
         edge = np.unique(chart[np.isclose(chart[:, 0], 2.0)][:, 1].round(4))
         assert len(edge) >= 5
         assert (rule != "all") or np.diff(edge) == pytest.approx(np.full(len(edge) - 1, 4 / (len(edge) - 1)), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("charts", "kept"),
+    [
+        ([0, 0, 1, 2], ("cornersPlus1", "cornersPlus2")),  # three charts meet
+        ([0, 0, 1, 0], ("cornersPlus2",)),  # a chart around the corner of another one
+        ([0, 0, 1, 1], ()),  # a seam that goes straight on
+    ],
+)
+@pytest.mark.parametrize("rule", ["none", "cornersOnly", "cornersPlus1", "cornersPlus2", "boundaries", "all"])
+def test_which_corners_of_a_chart_stay(charts: list[int], kept: tuple[str, ...], rule: str) -> None:
+    """In the middle of four faces, of the chart of the first two: pinned, or a cubic B-spline along its seam."""
+    points, faces = grid(2)
+    rng = np.random.default_rng(0)
+    of_chart = rng.normal(size=(3, 9, 3)).astype(np.float32)
+    values = [tuple(of_chart[chart, i].tolist()) for chart, face in zip(charts, faces, strict=True) for i in face]
+    text = primvar("displayColor", "color3f", values, "faceVarying")
+    found, at = carried(points, faces, f'{text}uniform token faceVaryingLinearInterpolation = "{rule}"')
+    middle = np.isclose(at, (1.0, 1.0, 0.0)).all(axis=2) & (at[..., 1].mean(axis=1) < 1)[:, None]
+    mine = of_chart[0]
+    ends = (3, 5) if charts[3] else (3, 7)
+    pinned = rule in (*kept, "boundaries", "all")
+    expected = mine[4] if pinned else (4 * mine[4] + mine[ends[0]] + mine[ends[1]]) / 6
+    assert found[middle] == pytest.approx(np.broadcast_to(expected, found[middle].shape), abs=1e-5)
+
+
+@pytest.mark.parametrize("rule", ["cornersPlus1", "cornersPlus2"])
+def test_where_a_seam_ends(rule: str) -> None:
+    """Values differ at one end of one edge only: its other end is inside of the chart, and pinned by cornersPlus2."""
+    points, faces = grid(2)
+    of_point = np.random.default_rng(2).normal(size=(10, 3)).astype(np.float32)
+    faces_of_values = [[9 if (i == 7 and k == 3) else i for i in face] for k, face in enumerate(faces)]
+    values = [tuple(of_point[i].tolist()) for face in faces_of_values for i in face]
+    text = primvar("displayColor", "color3f", values, "faceVarying")
+    found, at = carried(points, faces, f'{text}uniform token faceVaryingLinearInterpolation = "{rule}"')
+    middle = np.isclose(at, (1.0, 1.0, 0.0)).all(axis=2)
+    spline = (4 * of_point[4] + of_point[7] + of_point[9]) / 6
+    expected = of_point[4] if rule == "cornersPlus2" else spline
+    assert found[middle] == pytest.approx(np.broadcast_to(expected, found[middle].shape), abs=1e-5)
 
 
 def test_face_varying_of_one_chart_is_as_smooth_as_the_surface() -> None:
