@@ -23,7 +23,7 @@ from .cages import (
     read_cage,
     steps_of,
     without_repeats,
-)  # fmt: skip
+)
 from .primvars import Corners, Topology, Unusable, as_values, evaluate, to_corners
 from .refined import Fineness, surface
 from .triangulate import (
@@ -36,7 +36,7 @@ from .triangulate import (
     smooth_normals,
     triangulate,
     turned_over,
-)  # fmt: skip
+)
 
 INWARDS = "the mesh is closed but its faces look inwards"
 TURN = "turn its orientation attribute round, or reverse its faces"
