@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import checker_room, draw, glass, light, material, quad, scene, shell
+from scenes import box, checker_room, draw, glass, light, material, quad, scene, shell
 
 import refract_core as rc
 from refract_core.scene import Environment, LightKind, Model, Probe, Sphere, Volume
@@ -102,3 +102,15 @@ def test_the_camera_light_is_said_and_can_be_left_out() -> None:
     assert on.planes["beauty"][4, 4, :3].min() > 0.1
     assert not off.notices
     assert off.planes["beauty"][..., :3].max() == 0.0
+
+
+def test_the_camera_light_burns_no_spot_into_glass_that_faces_it() -> None:
+    """A slab before a wall that the eye's lamp lights, without shadows: the wall, 2 F / (1 + F) of it lost at the two
+    faces."""
+    wall = quad("/wall", [(-9, -9, -1), (9, -9, -1), (9, 9, -1), (-9, 9, -1)])
+    slab = box("/slab", (0.6, 0.6, 0.1), 1)
+    kinds = [material("/white", DIFFUSE=0.5, SPECULAR=0.0, IOR=1.0), glass(Model.TRACED, 1.5)]
+    bare = draw(scene([wall], kinds, camera_light=True), 32, 32)["beauty"][14:18, 14:18, :3]
+    seen = draw(scene([wall, slab], kinds, camera_light=True), 32, 32, cut=1e-4)["beauty"][14:18, 14:18, :3]
+    reflected = (0.5 / 2.5) ** 2
+    np.testing.assert_allclose(seen / bare, 1.0 - 2.0 * reflected / (1.0 + reflected), rtol=2e-3)

@@ -375,7 +375,7 @@ def _shine(scratch: TreeScratch, world: World, taken: int) -> None:
             continue
         i, side = now.pixel[lane], now.side[lane]
         w, share = row(now.weight, lane), opacities[lane]
-        gloss = mul(w, row(block.specular, lane))
+        gloss = mul(w, row(block.specular, lane)) if world.gleams else (0.0, 0.0, 0.0)
         lit = scale(mul(row(block.albedo, lane), row(block.diffuse, lane)), 1.0 / math.pi)
         body = scale(mul(w, add(row(block.emissive, lane), lit)), share)
         _glow(scratch, i, gloss, MIRRORED_SIDE if side == VIEW else side, now.way[lane], 1)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..errors import SceneError
 from ..kernels.arrays import F32_1D, F32_2D, F32_3D, I32_1D, I32_2D, I32_3D, I64_1D, I64_2D, U8_1D, U32_2D
 from ..models import BY_TOKEN
-from ..scene import Material, Mesh, Model, Param, Scene, Source, Sphere, prim_of
+from ..scene import LightKind, Material, Mesh, Model, Param, Scene, Source, Sphere, prim_of
 from . import embree
 from .caustics import Caustics, no_caustics
 from .embree import (
@@ -127,7 +127,8 @@ class World(NamedTuple):
     lit: bool
     """Some light or the sky shines; otherwise all light is emitted, and falls on nothing."""
     gleams: bool
-    """Some light has highlights."""
+    """Some light has highlights in glass. The one that stands in at the eye has none: it would burn a white spot into
+    whatever faces the eye."""
 
 
 def world_of(
@@ -142,7 +143,7 @@ def world_of(
     walked = bool((materials.model != Model.NONE).any())
     glass = GlassShade(np.zeros(len(geometry.thing), np.uint8), walked)
     cutouts = bool(materials.cutout.any())
-    gleams = bool((lights.specular > 0.0).any())
+    gleams = bool(((lights.specular > 0.0) & (lights.kind != LightKind.CAMERA)).any())
     return World(geometry, materials, textures, lights, environment, glass, no_caustics(), cutouts, lit, gleams)
 
 

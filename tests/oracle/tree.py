@@ -402,7 +402,9 @@ class Tree:
         """Of the surface itself. What the first one sends out by itself is in neither of the planes."""
         gathered = self.shader.gather(s, _key(view, ray), view.sample, mirrored)
         own = mul(ray.weight, scaled(diffuse(s, gathered), opacity))
-        highlights = mul(ray.weight, gathered.highlights)
+        # The lamp that stands in at the eye has no highlights in glass.
+        gleams = any(lamp.kind is not None and lamp.specular > 0.0 for lamp in self.shader.lamps)
+        highlights = mul(ray.weight, gathered.highlights) if gleams else ZERO
         if ray.side is Side.VIEW:
             grown.color = add(grown.color, own)
             grown.gain(Side.MIRRORED, highlights)
