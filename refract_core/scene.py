@@ -107,6 +107,8 @@ class Material:
     """> 0 cuts out: opaque where opacity >= threshold, absent elsewhere."""
     absorption_distance: float = 1.0
     """[m]"""
+    tints: bool = False
+    """Its colour came without a distance, as the tint of a surface: readers put the way through its bodies there."""
     abbe: float = 0.0
     """Abbe number V_d; 0 means no dispersion."""
     priority: int = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -159,6 +160,16 @@ def test_a_tint_is_reached_through_the_whole_body(tmp_path: Path) -> None:
     row = run(stage(tmp_path, "mdl:", OMNI), tmp_path / "out.usda")["M"]
     assert row.model == "sphere"
     assert row.distance == row.thickness == pytest.approx(2.0, rel=1e-5)
+
+
+def test_a_tint_of_any_other_body_is_reached_over_the_mean_way_through_it(tmp_path: Path) -> None:
+    """4 V / S of a cone: a third of pi r^2 h over pi r (r + s). Drawn as it is and as it is converted."""
+    path, out = stage(tmp_path, "mdl:", OMNI, "Cone"), tmp_path / "out.usda"
+    row = run(path, out)["M"]
+    assert row.model == "traced"
+    assert row.distance == pytest.approx(4.0 / 3.0 * 2.0 / (1.0 + math.sqrt(5.0)), rel=0.02)
+    before, after = (material(scene, "M").absorption_distance for scene in both(path, out))
+    assert before == pytest.approx(after, rel=1e-4)
 
 
 def test_a_mapped_colour_stays_mapped(tmp_path: Path) -> None:

@@ -363,6 +363,33 @@ def test_the_camera_light_does_not_shine_on_what_glows(glow: str, lit: bool) -> 
     assert read(BALL + bound.replace("GLOW", glow).replace("</M>", "</N>")).camera_light  # bound to nothing
 
 
+# --- tints
+
+TINTED = """
+    def Material "Amber" {
+        token outputs:mtlx:surface.connect = </Amber/S.outputs:out>
+        def Shader "S" {
+            uniform token info:id = "ND_standard_surface_surfaceshader"
+            float inputs:transmission = 1
+            color3f inputs:transmission_color = (0.9, 0.6, 0.2)
+            token outputs:out
+        }
+    }
+"""
+
+
+@pytest.mark.parametrize("size", [0.01, 2.0, 300.0])
+@pytest.mark.parametrize(("kind", "way"), [("Sphere", 4.0 / 3.0), ("Cube", 4.0 / 3.0)])
+def test_a_tint_is_left_after_the_mean_way_through_its_body(kind: str, way: float, size: float) -> None:
+    """4 V / S: of a ball 4 r / 3, of a cube 2/3 of its side; whatever the size."""
+    side = f"double radius = {size}" if kind == "Sphere" else f"double size = {2 * size}"
+    what = read(f"{TINTED}def {kind} \"Bead\" (prepend apiSchemas = [\"MaterialBindingAPI\"]) {{ {side}\n"
+                "rel material:binding = </Amber> }")  # fmt: skip
+    (amber,) = (material for material in what.materials if material.name == "/Amber")
+    assert amber.absorption_distance / what.metres_per_unit == pytest.approx(way * size, rel=1e-4)
+    assert "without a depth" in texts(what, "/Amber")
+
+
 # --- real stages ----------------------------------------------------------------------------------------------------
 
 REFUSED = {"framesPerSecond_-1.usda", "framesPerSecond_0.usda"}

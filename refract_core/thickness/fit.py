@@ -14,14 +14,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..models import Behind, Model, model_for
 from ..scene import F64
-from ..world.solid import crossings, is_convex, signed_volume
+from ..world.solid import crossings, is_convex, mean_way, signed_volume
 
 SPHERE_RESIDUAL = 0.05
 """A ball: root mean square distance of the surface from the best sphere, against its radius."""
@@ -63,6 +63,8 @@ class Fit:
     convex: bool
     why: str
     """A few words for a person."""
+    way: float = 0.0
+    """Mean way through it (`solid.mean_way`); 0 where it is open."""
 
 
 def fit(points: F64, triangles: NDArray[np.integer]) -> Fit:
@@ -75,6 +77,12 @@ def fit(points: F64, triangles: NDArray[np.integer]) -> Fit:
     points, corners = _welded(np.asarray(points, np.float64), np.asarray(triangles, np.int64))
     if not len(corners):
         return Fit(_WALL, 0.0, False, False, "no triangles")
+    found = _fit(points, corners)
+    return replace(found, way=mean_way(points, corners)) if found.closed else found
+
+
+def _fit(points: F64, corners: Index) -> Fit:
+    """The same of points that are one where they touch, and triangles that have an area."""
     if not _is_closed(corners):
         return Fit(_WALL, _smallest_side(points[np.unique(corners)]), False, False, "open")
     parts = _parts(corners, len(points))

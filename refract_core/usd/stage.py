@@ -25,6 +25,7 @@ from .geometry.refined import MOST_TRIANGLES, Fineness
 from .geometry.shapes import INWARDS, TURN, Shape, read_shape
 from .geometry.skel import posed
 from .geometry.traverse import Placement, refuse_too_many, some_of, walk
+from .geometry.ways import with_ways
 from .layers import mtlx
 from .lights.meshes import glowing
 from .lights.read import read_lights
@@ -230,6 +231,7 @@ def _read(
     centre = _origin(*extent)
     meshes, spheres = _drawn(placed, centre)
     meshes = glowing(stage, time, meshes, tables.materials, metres_per_unit=metres_per_unit, notices=notices)
+    materials = with_ways(tables.materials, meshes, spheres, metres_per_unit, notices)
     engine_from_stage = metres_from_stage.copy()
     engine_from_stage[:3, 3] = -centre
     bounds = triple(extent[0] - centre), triple(extent[1] - centre)
@@ -248,7 +250,7 @@ def _read(
     lit = bool(glow & used) or any(prim.HasAPI(UsdLux.LightAPI) for prim in every)
     return Scene(
         meshes=meshes,
-        materials=tuple(tables.materials),
+        materials=tuple(materials),
         spheres=spheres,
         textures=tuple(tables.textures.values()),
         lights=lights,

@@ -181,7 +181,7 @@ def _plan(glass: Glass, uses: list[Use], forced: str, unit: float) -> _Plan:
         if per_prim is None and not forced:
             model, thickness, more = SOLID, None, []
             why = "one prim is drawn in several sizes, and a typed thickness is one number"
-    color, distance = _absorption(glass, model, thickness, unit, more)
+    color, distance = _absorption(glass, model, thickness, uses, unit, more)
     if glass.authored:
         more.append(f"authored already, and kept: {', '.join(sorted(glass.authored))}")
     driver = glass.color_from or (glass.color_map.told() if glass.color_map else "")
@@ -234,7 +234,7 @@ def _thickness(glass: Glass, uses: list[Use]) -> tuple[float | None, dict[str, f
 
 
 def _absorption(
-    glass: Glass, model: Model, thickness: float | None, unit: float, notes: list[str]
+    glass: Glass, model: Model, thickness: float | None, uses: list[Use], unit: float, notes: list[str]
 ) -> tuple[tuple[float, float, float], float | None]:
     """Colour and the distance after which it is left; None where the model fixes it or nothing is absorbed."""
     color = tuple(neat(value) for value in glass.color)
@@ -255,7 +255,8 @@ def _absorption(
         return color, None  # type: ignore[return-value]
     if glass.distance is not None:
         return color, neat(glass.distance)  # type: ignore[return-value]
-    distance = (thickness if model.sized else None) or glass.thickness or 1.0
+    ways = [fit.way for use in uses for fit in use.fits if fit.way > 0.0]
+    distance = (thickness if model.sized else None) or glass.thickness or (neat(median(ways)) if ways else 1.0)
     notes.append(f"its colour tints a surface at any depth; here it is left after {distance:g} units")
     return color, distance  # type: ignore[return-value]
 

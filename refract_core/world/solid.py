@@ -27,6 +27,14 @@ def signed_volume(points: F64, triangles: NDArray[np.integer]) -> float:
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum()) / 6.0
 
 
+def mean_way(points: F64, triangles: NDArray[np.integer]) -> float:
+    """Mean length of the ways through a closed surface, 4 V / S (Cauchy 1841), in its unit; 0 where it encloses
+    nothing."""
+    a, b, c = (points[triangles[:, corner]] for corner in range(3))
+    surface = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2.0
+    return 4.0 * abs(signed_volume(points, triangles)) / surface if surface > 0.0 else 0.0
+
+
 def looks_inwards(points: F64, triangles: NDArray[np.integer]) -> bool:
     """A closed surface is inside out: as a whole, so the inner shell of something hollow does not make it so."""
     return signed_volume(points, triangles) < -_NOTHING * float(np.linalg.norm(np.ptp(points, axis=0))) ** 3

@@ -276,7 +276,7 @@ def _open_pbr(record: Material, unit: float) -> tuple[_Inputs, _Inputs]:
         "transmission_weight": neat(1.0 - _one(record, Param.OPACITY)),
         "specular_ior": _one(record, Param.IOR),
         "transmission_color": _three(record.inputs[Param.TRANSMITTANCE]),
-        "transmission_depth": 0.0 if thin else neat(record.absorption_distance / unit),
+        "transmission_depth": 0.0 if thin or record.tints else neat(record.absorption_distance / unit),
         "geometry_thin_walled": thin,
     }
     if record.abbe > 0.0:

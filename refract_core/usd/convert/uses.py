@@ -166,4 +166,4 @@ def _fit(shape: Shape, triangles: U32, scale: float, gram: F64, fits: _Fits) -> 
         fits[key] = fit(stretched, triangles)
         if not fits[key].closed and shape.closed and len(triangles) < len(shape.triangles):
             fits[key] = replace(fits[key], model=SOLID, closed=True, why="an open part of a closed mesh")
-    return replace(fits[key], thickness=fits[key].thickness * scale)
+    return replace(fits[key], thickness=fits[key].thickness * scale, way=fits[key].way * scale)

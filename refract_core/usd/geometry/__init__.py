@@ -1,3 +1,3 @@
 """Prims with a surface as triangles at their places in engine world. Knows no light and no camera."""
 
-__all__ = ["cages", "parts", "place", "primvars", "refined", "shapes", "skel", "traverse", "triangulate"]
+__all__ = ["cages", "parts", "place", "primvars", "refined", "shapes", "skel", "traverse", "triangulate", "ways"]

@@ -161,18 +161,16 @@ def _shader_glass(context: Context, row: Material, surface: Surface, *, thin: bo
     """Glass that its surface shader alone describes: thin-walled or open, else traced through the real mesh.
 
     A transmission colour without a distance (OpenPBR: depth 0) tints the surface once. The thin model reaches that
-    colour after exactly its own 5 mm; a solid reaches it after one scene unit, the schema's default distance. The thin
-    model has no other distance, so a colour with one is taken to 5 mm (Beer-Lambert).
+    colour after exactly its own 5 mm; a solid after the mean way through its bodies (`ways`), of which this knows
+    nothing yet. The thin model has no other distance, so a colour with one is taken to 5 mm (Beer-Lambert).
     """
     if thin:
         color = _thin_color(context, row.inputs[Param.TRANSMITTANCE], surface.absorption_distance)
         changes = {Param.THICKNESS: constant(SHEET.fixed_thickness), Param.TRANSMITTANCE: color}
         return _with(row, changes, model=SHEET, absorption_distance=SHEET.fixed_thickness)
     tint = row.inputs[Param.TRANSMITTANCE]
-    if surface.absorption_distance is None and tint != constant(DEFAULTS[Param.TRANSMITTANCE]):
-        note(context, "has a transmission colour without a depth, which tints a surface; "
-             "it is read as the colour left after one scene unit; author a depth")  # fmt: skip
-    return _with(row, {}, model=SOLID, absorption_distance=surface.absorption_distance or unit)
+    tints = surface.absorption_distance is None and tint != constant(DEFAULTS[Param.TRANSMITTANCE])
+    return _with(row, {}, model=SOLID, absorption_distance=surface.absorption_distance or unit, tints=tints)
 
 
 def _thin_color(context: Context, color: Source, distance: float | None) -> Source:
