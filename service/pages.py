@@ -21,7 +21,7 @@ _HEAD = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="view
 
 
 _VIEWER = """<link rel="stylesheet" href="static/swagger/swagger-ui.css"><div id="viewer"></div>
-<script src="static/swagger/swagger-ui-bundle.js"></script><script src="static/docs.js"></script>"""
+<script src="static/swagger/swagger-ui-bundle.js"></script><script src="static/viewer/docs.js"></script>"""
 
 
 def words() -> str:

@@ -106,7 +106,8 @@ def test_meshes_at_sixteen_samples_do_not_depend_on_workers_or_tiles(meshes: Sce
 
 
 def test_a_given_executor_draws_the_same(mixed: Scene) -> None:
-    settings = rc.RenderSettings(image_width=40, image_height=40, samples=1, tiers=("ray", "sky"), caustics=0)
+    plain: dict[str, Any] = {"samples": 1, "tiers": ("ray", "sky"), "caustics": 0, "emission_light": False}
+    settings = rc.RenderSettings(image_width=40, image_height=40, **plain)
     with ThreadPoolExecutor(3) as executor:
         given = rc.render(mixed, settings, executor=executor).planes
     assert_same(given, draw(mixed, 40, 40))
