@@ -264,7 +264,8 @@ def ball_of_glass() -> tuple[dict[str, Any], bytes]:
     document = {
         "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "material": 0}]}],
-        "materials": [{"extensions": {"KHR_materials_transmission": {"transmissionFactor": 1.0}}}],
+        "materials": [{"extensions": {"KHR_materials_transmission": {"transmissionFactor": 1.0}},
+                       "pbrMetallicRoughness": {"metallicFactor": 0.0}}],  # without it, it is metal
         "extensionsUsed": ["KHR_materials_transmission"], "accessors": accessors, "bufferViews": views,
         "buffers": [{"uri": "ball%20points.bin", "byteLength": len(content)}],
     }  # fmt: skip
