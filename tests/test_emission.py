@@ -131,6 +131,26 @@ def test_many_things_share_lights_and_lose_nothing() -> None:
     assert len(table_of(lit_by(*bodies)).kind) <= 16
 
 
+@pytest.mark.parametrize("count", [16, 17, 40])
+def test_many_spheres_are_their_lamps(count: int) -> None:
+    """Up to sixteen are lamps of their own, more are facets in a tree."""
+    rng = np.random.default_rng(5)
+    places = np.column_stack([rng.uniform(-2, 2, count), np.full(count, 1.5), rng.uniform(-2, 2, count)])
+    balls = [Sphere(f"/ball{k}", (float(x), float(y), float(z)), 0.02, 1) for k, (x, y, z) in enumerate(places)]
+    lamps = tuple(lamp(LightKind.SPHERE, place, (0.02, 0.0)) for place in places)
+    np.testing.assert_allclose(floor(lit_by(*balls)), floor(lit_by(lights=lamps)), rtol=0.04)
+    assert len(table_of(lit_by(*balls)).kind) <= 16
+
+
+def test_what_is_no_number_lights_nothing_else_wrongly() -> None:
+    """A picture with an infinity and a value that is none: the rest of it is as it is."""
+    picture = np.ones((8, 8, 4), np.float32)
+    picture[0, 0, :3], picture[7, 7, :3] = np.inf, np.nan
+    painted = material("/glow", EMISSIVE=Source(texture=0, channel=Channel.RGB, uv_primvar="st"), IOR=1.0)
+    found = floor(replace(lit_by(PANEL), materials=(WHITE, painted), textures=(Texture("glow", picture),)))
+    assert np.isfinite(found).all()
+
+
 def test_glass_of_index_one_lets_it_through() -> None:
     """Photons start as bright as what glows is from there."""
     ball = Sphere("/lens", (0.1, 0.8, 0.0), 0.25, 2)

@@ -118,7 +118,9 @@ def _with_glow(world: World, scene: Scene, camera: Camera, settings: RenderSetti
     """With what the stage's own surfaces emit among the lights."""
     eye = camera.world_from_camera[:3, 3]
     glow = what_glows(world, scene, eye) if settings.emission_light else None
-    return world if glow is None else world._replace(lights=pack_lights(scene, eye, glow), lit=True)
+    if glow is None or not glow.lights:
+        return world
+    return world._replace(lights=pack_lights(scene, eye, glow), lit=True)
 
 
 def _runner(work: Work, span: tuple[float, float]) -> Run:

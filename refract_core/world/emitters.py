@@ -25,13 +25,15 @@ from .surface import Hit, Interaction, Ray, color_input, corners_of, interaction
 from .tables import World, rows_of
 
 _MOST_LIGHTS = 16
-"""Lights that all that glows may be, beside exact spheres."""
+"""Lights that all that glows may be, and as many exact spheres; more of these are triangles, too."""
 _MOST_PIECES = 1 << 16
 """Pieces of an object that are looked at; of more, an even choice by area stands for all."""
 _PIECES = 128
 """Pieces that an object is cut into whose glow is a picture or a primvar, about."""
 _MOST_CUTS = 4
 """Times that a triangle is cut in four at most."""
+_BRIGHTEST = 1e30
+"""Radiance that anything has at most, so that sums stay numbers."""
 _FAINT = 1e-4
 """Part of all the power of what glows below which an object lights nothing."""
 _SHADES = 8.0
@@ -63,18 +65,21 @@ def what_glows(world: World, scene: Scene, eye: F64) -> Glow | None:
     emits = np.array([material.emits and not material.refractive for material in scene.materials], np.bool_)
     if not emits[world.geometry.material].any():
         return None
-    balls: list[Light] = []
+    seen, exact = by_address(world), world.geometry.sphere[:, 3] > 0.0
     objects: dict[int, list[_Pieces]] = {}
-    for part in range(len(world.geometry.thing)):
-        glowing = np.flatnonzero(emits[world.geometry.material[rows_of(world.geometry, part)]])
-        if not len(glowing):
-            continue
-        exact = world.geometry.sphere[part, 3] > 0.0
-        pieces = _ball(part) if exact else _pieces(world, scene, part, glowing, eye)
-        emission_of(by_address(world), pieces.part, pieces.primitive, pieces.bary, pieces.radiance)
-        if exact:
+    parts = [part for part in range(len(exact)) if emits[world.geometry.material[rows_of(world.geometry, part)]].any()]
+    few = exact[parts].sum() <= _MOST_LIGHTS
+    balls: list[Light] = []
+    for part in parts:
+        pieces = _facets(world, part) if exact[part] else _pieces(world, scene, part, emits, eye)
+        emission_of(seen, pieces.part, pieces.primitive, pieces.bary, pieces.radiance)
+        np.nan_to_num(pieces.radiance, copy=False, nan=0.0, posinf=_BRIGHTEST)
+        np.clip(pieces.radiance, 0.0, _BRIGHTEST, out=pieces.radiance)
+        if exact[part] and few:
             balls += _lamp(world, part, pieces.radiance[0])
         else:
+            if exact[part]:  # its triangles are larger than it is
+                pieces = pieces._replace(radiance=pieces.radiance * _SHARE_OF_ROUND)
             objects.setdefault(int(world.geometry.thing[part]), []).append(pieces)
     whole = [_Pieces(*(np.concatenate(column) for column in zip(*parts, strict=True))) for parts in objects.values()]
     lights, trees = _lights(whole)
@@ -125,11 +130,12 @@ def _there(world: World, at: Interaction) -> float:
     return opacity
 
 
-def _pieces(world: World, scene: Scene, part: int, glowing: NDArray[np.int64], eye: F64) -> _Pieces:
-    """Triangles `glowing` of a part, cut, turned to where they shine, those of an open mesh twice."""
+def _pieces(world: World, scene: Scene, part: int, emits: NDArray[np.bool_], eye: F64) -> _Pieces:
+    """Triangles of a part that emit, cut, turned to where they shine, those of an open mesh twice."""
     geometry = world.geometry
     mesh = scene.meshes[geometry.thing[part]]
     rows = rows_of(geometry, part)
+    glowing = np.flatnonzero(emits[geometry.material[rows]])
     corners = geometry.points[geometry.triangles[rows][glowing]].astype(np.float64)
     areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     kept = areas > 0.0
@@ -177,11 +183,42 @@ def _cut(cuts: NDArray[np.int64]) -> tuple[NDArray[np.int64], F64]:
     return which, bary
 
 
-def _ball(part: int) -> _Pieces:
-    """The one place of a sphere whose emission stands for all of it."""
-    one = np.array([part], np.int32)
-    bary = np.full((1, 3, 2), 1.0 / 3.0)
-    return _Pieces(one, np.zeros(1, np.int32), bary, np.zeros((1, 3, 3)), np.zeros((1, 3)))
+def _facets(world: World, part: int) -> _Pieces:
+    """An exact sphere as 80 triangles around it, each of which has the emission of its one place. They touch it, for a
+    shadow ray must end before it meets it."""
+    ball = world.geometry.sphere[part].astype(np.float64)
+    corners = _ROUND * ball[3] + ball[:3]
+    count = len(corners)
+    bary = np.full((count, 3, 2), 1.0 / 3.0)
+    return _Pieces(
+        np.full(count, part, np.int32), np.zeros(count, np.int32), bary, corners, np.zeros((count, 3))
+    )
+
+
+def _round() -> F64:
+    """Shape (80, 3, 3): an icosahedron, each face cut in four, around the unit sphere."""
+    g = (1.0 + math.sqrt(5.0)) / 2.0
+    places = np.array([(a, b * g, 0.0) for a in (-1, 1) for b in (-1, 1)])
+    points = np.concatenate([np.roll(places, k, axis=1) for k in range(3)])
+    near = np.linalg.norm(points[:, None] - points[None], axis=2) < 2.1
+    threes = [(i, j, k) for i in range(12) for j in range(i) for k in range(j)]
+    met = [(i, j, k) for i, j, k in threes if near[i, j] and near[j, k] and near[i, k]]
+    a, b, c = (points[list(column)] for column in zip(*met, strict=True))
+    ab, bc, ca = a + b, b + c, c + a
+    faces = np.concatenate([np.stack(f, axis=1) for f in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
+    faces /= np.linalg.norm(faces, axis=2, keepdims=True)
+    normals = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
+    turned = (normals * faces[:, 0]).sum(axis=1) < 0.0
+    faces[turned] = faces[turned][:, ::-1]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    grown: F64 = faces / np.abs((normals * faces[:, 0]).sum(axis=1)).min()
+    return grown
+
+
+_ROUND = _round() * 1.0001
+_SHARE_OF_ROUND = 8.0 * math.pi / float(
+    np.linalg.norm(np.cross(_ROUND[:, 1] - _ROUND[:, 0], _ROUND[:, 2] - _ROUND[:, 0]), axis=1).sum()
+)
 
 
 def _lamp(world: World, part: int, radiance: F64) -> list[Light]:
