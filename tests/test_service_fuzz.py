@@ -1,6 +1,6 @@
 """Damaged stages, byte by byte: every one is drawn, described or refused in our own words, and nothing else happens.
 
-200 files; `REFRACT_FUZZ=5000` sends 5000.
+100 files; `REFRACT_FUZZ=5000` sends 5000.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from service_server import BALL, PATIENT, ROOT, SMALL, Server, running, until, u
 from service.problems import KINDS
 
 pytestmark = pytest.mark.slow
-COUNT = int(os.environ.get("REFRACT_FUZZ", "200"))
+COUNT = int(os.environ.get("REFRACT_FUZZ", "100"))
 WORKERS = 2
 LISTENS = "0A"
 """State of a socket in /proc/net/tcp that is no connection."""

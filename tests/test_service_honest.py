@@ -84,13 +84,13 @@ def test_an_error_of_syntax_in_a_part_is_told_by_line_and_column(client: httpx.C
 def test_a_texture_as_large_as_the_limit_is_drawn(client: httpx.Client) -> None:
     side = 8192
     assert side * side == Limits().texture_pixels
-    light = np.full((side, side, 3), 0.25, np.float32)
     spec = exr_spec(side, side, "RGB", ["half"] * 3, {})
+    picture = encoded("light.exr", np.full((side, side, 3), 0.25, np.float32), spec)
     sky = 'def DomeLight "Sky"\n    {\n        asset inputs:texture:file = @sky.exr@\n    }\n    def Material "Glass"'
-    files = package({"a.usda": BALL.replace('def Material "Glass"', sky), "sky.exr": encoded("sky.exr", light, spec)})
+    files = package({"a.usda": BALL.replace('def Material "Glass"', sky), "sky.exr": picture})
     assert not [text for text in warnings(client, render(client, upload(files))) if "sky" in text]
     surface = textured("wall.exr")
-    files = package({"a.usda": surface, "wall.exr": encoded("wall.exr", light, spec)})
+    files = package({"a.usda": surface, "wall.exr": picture})
     assert not [text for text in warnings(client, render(client, upload(files))) if "wall" in text]
 
 
