@@ -119,10 +119,10 @@ def test_what_is_half_there_lights_half() -> None:
 
 
 def test_many_things_share_lights_and_lose_nothing() -> None:
-    """Forty small bodies side by side, each as the ball light that sends out as much."""
+    """Eighty small bodies side by side, each as the ball light that sends out as much."""
     rng = np.random.default_rng(3)
-    places = np.column_stack([rng.uniform(-2, 2, 40), np.full(40, 1.5), rng.uniform(-2, 2, 40)])
-    bodies = [globe(f"/globe{k}", 0.02, 1, 12, place) for k, place in enumerate(places)]
+    places = np.column_stack([rng.uniform(-2, 2, 80), np.full(80, 1.5), rng.uniform(-2, 2, 80)])
+    bodies = [globe(f"/globe{k}", 0.012, 1, 12, place) for k, place in enumerate(places)]
     a, b, c = (bodies[0].points[bodies[0].triangles[:, k]].astype(np.float64) for k in range(3))
     radius = math.sqrt(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 / (4.0 * math.pi))
     lamps = tuple(lamp(LightKind.SPHERE, place, (radius, 0.0)) for place in places)
