@@ -83,6 +83,19 @@ def test_glass_of_index_one_changes_no_light(name: str, shape: str) -> None:
     assert np.abs(blocks - 1.0).max() < 0.12
 
 
+@pytest.mark.parametrize("degrees", [20.0, 35.0, 44.0])
+def test_a_slope_gets_as_much_as_without_the_glass(degrees: float) -> None:
+    """Texels are squares seen along an axis of the world: on a slope they are larger than they look."""
+    rise = 50.0 * math.tan(math.radians(degrees))
+    slope = quad("/floor", [(-50, -rise, 50), (50, rise, 50), (50, rise, -50), (-50, -rise, -50)])
+    ball = Sphere("/body", (0.0, 0.8, 0.05), 0.3, 1)
+    bare, through = (
+        scene([slope], [WHITE, glass(Model.TRACED, 1.0)], balls, cameras=(under(0.2),), lights=(SUN,))
+        for balls in ([], [ball])
+    )
+    assert arriving(through).mean() == pytest.approx(arriving(bare).mean(), rel=0.02)
+
+
 @pytest.mark.parametrize("name", UNEVEN)
 def test_uneven_lights_lose_nothing_in_glass_of_index_one(name: str) -> None:
     """Photons start as bright as the cone, the picture and the tube are from there, colour by colour."""
