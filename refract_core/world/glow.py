@@ -16,9 +16,9 @@ import numpy as np
 
 from ..kernels.arrays import F64_1D, F64_2D, F64_3D, I32_1D
 from ..kernels.compile import inlined
-from ..kernels.vec import Vec, add, along, dot, length, lerp, normalize, row, scale, sub
+from ..kernels.vec import Vec, add, dot, length, row, scale, sub
 from ..scene import Light
-from .polygon import polygon_edge
+from .polygon import corner, polygon_irradiance
 
 _FAR = 8.0
 """Radii of a node away from which on it is a point: then that is right to half a percent, nearly everywhere."""
@@ -46,8 +46,7 @@ class GlowTree(NamedTuple):
     triangle: I32_1D
     """shape (M,): that a leaf is; -1 of an empty one"""
     corner: F64_3D
-    """shape (T, 3, 3): middle of a triangle, and two axes X and Y: its corners are at X, and at -X/2 +- sqrt(3)/2 Y
-    from the middle [m]"""
+    """shape (T, 3, 3): middle of a triangle, and two axes, as `polygon.corner` has them [m]"""
 
 
 class Glow(NamedTuple):
@@ -78,43 +77,6 @@ def _above(height: float, radius: float) -> float:
 
 
 @inlined
-def _corner(glow: GlowTree, t: int, k: int) -> Vec:
-    """Corner `k` of a triangle, of 0 to 3; the last is the first [m]."""
-    axes = glow.corner[t]
-    if k % 3 == 0:
-        return add(row(axes, 0), row(axes, 1))
-    side = 0.8660254037844386 if k == 1 else -0.8660254037844386
-    return add(along(row(axes, 0), row(axes, 1), -0.5), scale(row(axes, 2), side))
-
-
-@inlined
-def _triangle_irradiance(glow: GlowTree, t: int, p: Vec, n: Vec) -> float:
-    """Irradiance per radiance of one triangle, clipped at the receiver's horizon (Lambert 1760; Baum, Rushmeier and
-    Winget 1989)."""
-    total = 0.0
-    leaving = entering = n
-    cut = False
-    a = normalize(sub(_corner(glow, t, 0), p))
-    for k in range(3):
-        b = normalize(sub(_corner(glow, t, k + 1), p))
-        ha, hb = dot(a, n), dot(b, n)
-        start, end = a, b
-        if (ha > 0.0) != (hb > 0.0):
-            crossing = normalize(lerp(a, b, ha / (ha - hb)))
-            cut = True
-            if ha > 0.0:
-                end = leaving = crossing
-            else:
-                start = entering = crossing
-        if ha > 0.0 or hb > 0.0:
-            total += polygon_edge(start, end, n)
-        a = b
-    if cut:
-        total += polygon_edge(leaving, entering, n)
-    return abs(total) * 0.5
-
-
-@inlined
 def glow_irradiance(glow: GlowTree, root: int, p: Vec, n: Vec) -> float:
     """Unoccluded irradiance at `p` on a surface with normal `n`, per radiance that triangles of weight 1 have [sr]."""
     total = 0.0
@@ -142,7 +104,9 @@ def glow_irradiance(glow: GlowTree, root: int, p: Vec, n: Vec) -> float:
                 continue
         if glow.right[i] == 0:
             if toward > 0.0:
-                total += _triangle_irradiance(glow, glow.triangle[i], p, n) * power / glow.area[i]
+                axes = glow.corner[glow.triangle[i]]
+                c = sub(row(axes, 0), p)
+                total += polygon_irradiance(c, n, row(axes, 1), row(axes, 2), 3) * power / glow.area[i]
             i = glow.after[i]
         else:
             i += 1
@@ -181,9 +145,9 @@ def glow_target(glow: GlowTree, root: int, p: Vec, n: Vec, u1: float, u2: float)
             i, u1, chance = i + 1, u1 / share, chance * share
         else:
             i, u1, chance = glow.right[i], min((u1 - share) / (1.0 - share), 0.9999999), chance * (1.0 - share)
-    t = glow.triangle[i]
-    r = math.sqrt(u1)
-    a, b, c = _corner(glow, t, 0), _corner(glow, t, 1), _corner(glow, t, 2)
+    axes, r = glow.corner[glow.triangle[i]], math.sqrt(u1)
+    m, x, y = row(axes, 0), row(axes, 1), row(axes, 2)
+    a, b, c = corner(m, x, y, 0, 3), corner(m, x, y, 1, 3), corner(m, x, y, 2, 3)
     point = add(scale(a, 1.0 - r), add(scale(b, r * (1.0 - u2)), scale(c, r * u2)))
     to = sub(point, p)
     d2 = max(dot(to, to), 1e-12)

@@ -23,7 +23,7 @@ from ..kernels.vec import Vec, add, cross, dot, frame, length, lerp, normalize, 
 from ..optics.lobes import ggx, sample_cosine, smith_visibility
 from ..scene import LightKind
 from .glow import GlowTree, glow_irradiance, glow_target
-from .polygon import polygon_edge
+from .polygon import polygon_edge, polygon_irradiance
 
 _DISK_SIDES = 12
 """A disk's irradiance is that of the regular polygon with as many sides and the disk's area."""
@@ -350,48 +350,9 @@ def _flat_irradiance(lamp: Lamp, p: Vec, n: Vec, half_height: float, sides: int)
     if dot(to, lamp.face) >= 0.0:  # behind it
         return 0.0
     if lamp.a > 0.0:
-        return _polygon_irradiance(p, n, lamp.centre, scale(lamp.x, lamp.a), scale(lamp.y, half_height), sides)
+        c = sub(lamp.centre, p)
+        return polygon_irradiance(c, n, scale(lamp.x, lamp.a), scale(lamp.y, half_height), sides)
     return cosine * -dot(to, lamp.face) / math.sqrt(d2) / d2
-
-
-@inlined
-def _corner(c: Vec, x: Vec, y: Vec, k: int, sides: int) -> Vec:
-    """Corner `k` of the parallelogram with half axes x, y, or of the regular polygon with the area of their ellipse."""
-    if sides == 4:
-        sx = 1.0 if k % 4 == 1 or k % 4 == 2 else -1.0
-        sy = 1.0 if k % 4 == 2 or k % 4 == 3 else -1.0
-        return add(add(c, scale(x, sx)), scale(y, sy))
-    step = 2.0 * math.pi / sides
-    grow = math.sqrt(step / math.sin(step))
-    return add(add(c, scale(x, grow * math.cos(step * k))), scale(y, grow * math.sin(step * k)))
-
-
-@inlined
-def _polygon_irradiance(p: Vec, n: Vec, centre: Vec, x: Vec, y: Vec, sides: int) -> float:
-    """Irradiance per radiance of a flat light, clipped at the receiver's horizon
-    (Lambert 1760; Baum, Rushmeier and Winget 1989)."""
-    c = sub(centre, p)
-    total = 0.0
-    leaving = entering = c
-    cut = False
-    a = normalize(_corner(c, x, y, 0, sides))
-    for k in range(sides):
-        b = normalize(_corner(c, x, y, k + 1, sides))
-        ha, hb = dot(a, n), dot(b, n)
-        start, end = a, b
-        if (ha > 0.0) != (hb > 0.0):  # the horizon cuts this edge: the part above it counts
-            crossing = normalize(lerp(a, b, ha / (ha - hb)))
-            cut = True
-            if ha > 0.0:
-                end = leaving = crossing
-            else:
-                start = entering = crossing
-        if ha > 0.0 or hb > 0.0:
-            total += polygon_edge(start, end, n)
-        a = b
-    if cut:  # the edge along the horizon, which closes what is left of the polygon
-        total += polygon_edge(leaving, entering, n)
-    return abs(total) * 0.5
 
 
 @inlined
