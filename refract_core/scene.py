@@ -90,6 +90,11 @@ class Source:
     primvar: str = ""
     """Name of the primvar that gives the value itself, or ''."""
 
+    @property
+    def driven(self) -> bool:
+        """A texture or a primvar gives it, which `value` only stands in for."""
+        return self.texture >= 0 or bool(self.primvar)
+
 
 @dataclass(frozen=True)
 class Material:
@@ -122,7 +127,7 @@ class Material:
     def emits(self) -> bool:
         """Its emissive colour is not black, or a picture or primvar drives it."""
         source = self.inputs[Param.EMISSIVE]
-        if source.texture >= 0 or source.primvar:
+        if source.driven:
             return max(source.scale[:3]) > 0.0 or max(source.bias[:3]) > 0.0
         return max(source.value[:3]) > 0.0
 

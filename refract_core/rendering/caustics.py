@@ -28,7 +28,7 @@ from ..world.caustics import (
     no_caustics,
     raise_levels,
 )
-from ..world.solid import along_a_curve, encloses
+from ..world.solid import across, along_a_curve, areas, encloses
 from ..world.tables import GlassShade, World, rows_of
 from .work import Work
 
@@ -79,19 +79,13 @@ def _corners(world: World, part: int) -> F64:
     return corners
 
 
-def _across(corners: F64) -> F64:
-    """Normals of triangles, twice as long as their areas. Shape (T, 3)."""
-    normals: F64 = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return normals
-
-
 def _is_plate(world: World, part: int) -> bool:
-    across = _across(_corners(world, part))
-    area = np.linalg.norm(across, axis=1)
+    normals = across(_corners(world, part))
+    area = np.linalg.norm(normals, axis=1)
     if not area.any():
         return True
-    facing = across[area.argmax()] / area.max()
-    same_way = np.abs(across @ facing) > 0.999 * area
+    facing = normals[area.argmax()] / area.max()
+    same_way = np.abs(normals @ facing) > 0.999 * area
     return bool(area[same_way].sum() > _PLATE * area.sum())
 
 
@@ -101,18 +95,18 @@ def _is_plate(world: World, part: int) -> bool:
 def _sources(world: World, scene: Scene, casts: NDArray[np.bool_]) -> Sources:
     """Every piece of glass before every light; of very many, an even choice by area stands for all."""
     shadowing = _shadowing(world)
-    parts, primitives, areas = _pieces(world, casts)
+    parts, primitives, area = _pieces(world, casts)
     most = max(1, _MOST_SOURCES // max(1, len(shadowing)))
-    if len(areas) > most:
-        edges = np.cumsum(areas) / areas.sum()
+    if len(area) > most:
+        edges = np.cumsum(area) / area.sum()
         kept = np.searchsorted(edges, (np.arange(most) + 0.5) / most)
-        parts, primitives, areas = parts[kept], primitives[kept], np.full(most, areas.sum() / most)
+        parts, primitives, area = parts[kept], primitives[kept], np.full(most, area.sum() / most)
     rows: list[list[Any]] = []
     for light in shadowing:
         within = _bodies_around(world, scene, light, np.flatnonzero(casts))
         for side, these in ((1.0, np.arange(len(parts))), (-1.0, np.flatnonzero(np.isin(parts, within)))):
             same = np.ones(len(these))
-            rows.append([same * light, parts[these], primitives[these], same * side, areas[these]])
+            rows.append([same * light, parts[these], primitives[these], same * side, area[these]])
     columns: list[Any] = [np.concatenate(column) for column in zip(*rows, strict=True)]
     light_of, part, primitive = (column.astype(np.int32) for column in columns[:3])
     return Sources(light_of, part, primitive, columns[3], columns[4], np.zeros(len(part)))
@@ -136,10 +130,10 @@ def _pieces(world: World, casts: NDArray[np.bool_]) -> tuple[NDArray[np.int64], 
         else:
             corners = _corners(world, int(g))
             order = along_a_curve(corners.mean(axis=1))
-            area = 0.5 * np.linalg.norm(_across(corners), axis=1)[order]
+            area = areas(corners)[order]
         found.append((np.full(len(order), g), order, area))
-    parts, primitives, areas = (np.concatenate(column) for column in zip(*found, strict=True))
-    return parts, primitives, areas
+    whose, primitives, sizes = (np.concatenate(column) for column in zip(*found, strict=True))
+    return whose, primitives, sizes
 
 
 def _bodies_around(world: World, scene: Scene, light: int, parts: NDArray[np.int64]) -> list[int]:

@@ -21,7 +21,16 @@ from ..world import environment, textures
 from ..world.embree import Bvh
 from ..world.emitters import what_glows
 from ..world.lamps import pack_lights
-from ..world.tables import World, caster_sets, pack_geometry, pack_materials, primvar_slots, world_of
+from ..world.tables import (
+    Geometry,
+    MaterialTable,
+    World,
+    caster_sets,
+    pack_geometry,
+    pack_materials,
+    primvar_slots,
+    world_of,
+)
 from .caustics import caustics_of, plan_caustics, with_caustics
 from .session import Session
 from .work import Cancel, Progress, Work, working
@@ -97,14 +106,8 @@ def _prepare(
     over: Callable[[World, Bvh], Over] | None = None,
 ) -> Ready:
     geometry, bvh, slots = pack_geometry(scene, chosen.captured_sets)
-    dark = world_of(
-        geometry,
-        pack_materials(scene.materials, slots, settings.model),
-        textures.pack(scene.textures),
-        pack_lights(scene, camera.world_from_camera[:3, 3]),
-        environment.pack(scene.environment),
-    )
-    plain = _with_glow(dark, scene, camera, settings)
+    images, sky = textures.pack(scene.textures), environment.pack(scene.environment)
+    plain = _lit(scene, camera, settings, geometry, pack_materials(scene.materials, slots, settings.model), images, sky)
     thrown = caustics_of(plain, scene, plan_caustics(plain, camera, settings), work)
     world = by_address(with_caustics(plain, thrown))
     entries = chosen.entries
@@ -114,13 +117,22 @@ def _prepare(
     return Ready(world, bvh, table, chosen.thing_probe, rays, chosen.notices)
 
 
-def _with_glow(world: World, scene: Scene, camera: Camera, settings: RenderSettings) -> World:
-    """With what the stage's own surfaces emit among the lights."""
+def _lit(
+    scene: Scene,
+    camera: Camera,
+    settings: RenderSettings,
+    geometry: Geometry,
+    materials: MaterialTable,
+    images: textures.TextureTable,
+    sky: environment.EnvironmentTable,
+) -> World:
+    """The tables together, with what the stage's own surfaces emit among the lights."""
     eye = camera.world_from_camera[:3, 3]
-    glow = what_glows(world, scene, eye) if settings.emission_light else None
-    if glow is None or not glow.lights:
-        return world
-    return world._replace(lights=pack_lights(scene, eye, glow), lit=True)
+    unlit = pack_lights(replace(scene, lights=(), camera_light=False), eye)
+    glow = None
+    if settings.emission_light:
+        glow = what_glows(world_of(geometry, materials, images, unlit, sky), scene, eye)
+    return world_of(geometry, materials, images, pack_lights(scene, eye, glow), sky)
 
 
 def _runner(work: Work, span: tuple[float, float]) -> Run:
@@ -159,19 +171,16 @@ def _from_parts(
     sky = session.part("environment", scene.environment, lambda: environment.pack(scene.environment))
     geometry, bvh, slots = hierarchy.made
     materials = pack_materials(scene.materials, slots, settings.model)
-    lights = pack_lights(scene, camera.world_from_camera[:3, 3])
-    plain = _with_glow(world_of(geometry, materials, images.made, lights, sky.made), scene, camera, settings)
-    lights = plain.lights
+    plain = _lit(scene, camera, settings, geometry, materials, images.made, sky.made)
     wanted_light = plan_caustics(plain, camera, settings)
-    fallen = hierarchy.number, images.number, sky.number, tuple(lights), scene.materials, settings.model, wanted_light
-    thrown = session.part("caustics", fallen, lambda: caustics_of(plain, scene, wanted_light, work))
+    seen = hierarchy.number, images.number, sky.number, tuple(plain.lights), scene.materials, settings.model
+    thrown = session.part("caustics", (*seen, wanted_light), lambda: caustics_of(plain, scene, wanted_light, work))
     world = by_address(with_caustics(plain, thrown.made))
 
     rough = is_rough(scene)
     drawn = [entry for entry in chosen.entries if entry.drawn]
     # Probes that do not see glass still see what has come through it.
-    lit = hierarchy.number, images.number, sky.number, tuple(lights), scene.materials, settings.model, thrown.number
-    shown = *lit, rough, samples
+    shown = *seen, thrown.number, rough, samples
     # A probe that sees glass is drawn as a picture is, from the scene itself; how the work is cut up never changes it.
     asked = replace(settings, jobs=0, tile_size=64)
     glassy = asked, scene.bounds, scene.metres_per_unit
@@ -266,6 +275,6 @@ def is_rough(scene: Scene) -> bool:
     """Some refractive material may be rough, so the colour pyramid will be read above level 0."""
     for material in scene.materials:
         source = material.inputs[Param.ROUGHNESS]
-        if material.refractive and (source.value[0] > 0.0 or source.texture >= 0 or source.primvar):
+        if material.refractive and (source.value[0] > 0.0 or source.driven):
             return True
     return False

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ..models import Behind, Model, model_for
 from ..scene import F64
-from ..world.solid import crossings, is_convex, mean_way, signed_volume
+from ..world.solid import across, crossings, is_convex, mean_way, signed_volume
 
 SPHERE_RESIDUAL = 0.05
 """A ball: root mean square distance of the surface from the best sphere, against its radius."""
@@ -199,7 +199,7 @@ def _surface(points: F64, corners: Index) -> _Surface:
     if signed_volume(points, corners) < 0.0:
         corners = corners[:, ::-1]
     around = points[corners]
-    normals = np.cross(around[:, 1] - around[:, 0], around[:, 2] - around[:, 0])
+    normals = across(around)
     lengths = np.linalg.norm(normals, axis=1)
     keep = lengths > 0.0
     around, corners = around[keep], corners[keep]

@@ -26,6 +26,7 @@ from ..usd.stage import open_stage
 from ..usd.thickness.find import Body, Candidate, Coat, Found, find_candidates, read_body, stage_of
 from ..usd.thickness.write import MADE, Map, Values, lost_bindings, spread_values, write_maps, write_values
 from ..version import __version__
+from ..world.solid import areas
 from .orders import JOBS, check_range, file_names, make_folder_of, refuse_existing, select, stop_if
 
 ALONG = ("normal", "refracted")
@@ -292,14 +293,13 @@ def _gprim(candidate: Candidate, body: Body, how: How, notes: list[str]) -> F64 
     if body.radius > 0.0:  # a path of 2 R cos t
         return np.array([2.0 * body.radius * (rays[:, 2] * rays[:, 3]).sum() / (rays[:, 3] ** 2).sum()])
     values = measure(body.points, body.triangles, middle_places(body.normals), rays, jobs=how.jobs, go_on=how.go_on)
-    sides = body.points[body.triangles]
-    areas = np.linalg.norm(np.cross(sides[:, 1] - sides[:, 0], sides[:, 2] - sides[:, 0]), axis=1)
+    size = areas(body.points[body.triangles])
     known = np.isfinite(values)
     if not known.any():
         return "no ray found a far side"
-    values, areas = values[known], areas[known]
+    values, size = values[known], size[known]
     rank = np.argsort(values)
-    half = np.searchsorted(np.cumsum(areas[rank]), areas.sum() / 2.0)
+    half = np.searchsorted(np.cumsum(size[rank]), size.sum() / 2.0)
     middle = float(values[rank][min(int(half), len(values) - 1)])
     if values.max() - values.min() > _UNEVEN * middle:
         kind = candidate.prim.GetTypeName()

@@ -240,7 +240,7 @@ def _same_glass(material: Material, before: Material) -> Material:
     A mapped colour stays as it is, as everywhere.
     """
     color = before.inputs[Param.TRANSMITTANCE]
-    if material.absorption_distance == before.absorption_distance or color.texture >= 0 or color.primvar:
+    if material.absorption_distance == before.absorption_distance or color.driven:
         return material
     power = material.absorption_distance / before.absorption_distance
     red, green, blue, alpha = color.value

@@ -1,13 +1,14 @@
 """What glows, made into lights: triangles of opaque materials that emit become trees (`world.glow`), spheres lamps.
 
 A triangle emits what its material says; where that is a texture, large ones are cut, and each piece emits the mean over
-it. Each object is a light, unless there are very many: then neighbours of one colour are one
-together. A closed mesh shines outwards, but inwards where the eye is in it; an open one to both sides.
+it. Each object is a light, unless there are very many: then neighbours of one colour are one together. A closed mesh
+shines outwards, but inwards where the eye is in it; an open one to both sides.
 """
 
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from ..kernels.vec import along, cross, length, sub
 from ..scene import F64, Light, LightKind, Param, Scene
 from .environment import TEXEL_LUMINANCE
 from .glow import Glow, GlowTree, no_glow
-from .solid import along_a_curve, encloses
+from .solid import across, along_a_curve, areas, by_halves, encloses
 from .surface import Hit, Interaction, Ray, color_input, corners_of, interaction, share_input
 from .tables import World, rows_of
 
@@ -79,7 +80,7 @@ def what_glows(world: World, scene: Scene, eye: F64) -> Glow | None:
             balls += _lamp(world, part, pieces.radiance[0])
         else:
             if exact[part]:  # its triangles are larger than it is
-                pieces = pieces._replace(radiance=pieces.radiance * _SHARE_OF_ROUND)
+                pieces = pieces._replace(radiance=pieces.radiance * (4.0 * math.pi / areas(_round()).sum()))
             objects.setdefault(int(world.geometry.thing[part]), []).append(pieces)
     whole = [_Pieces(*(np.concatenate(column) for column in zip(*parts, strict=True))) for parts in objects.values()]
     lights, trees = _lights(whole)
@@ -137,15 +138,15 @@ def _pieces(world: World, scene: Scene, part: int, emits: NDArray[np.bool_], eye
     rows = rows_of(geometry, part)
     glowing = np.flatnonzero(emits[geometry.material[rows]])
     corners = geometry.points[geometry.triangles[rows][glowing]].astype(np.float64)
-    areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    kept = areas > 0.0
-    glowing, corners, areas = glowing[kept], corners[kept], areas[kept]
-    if len(areas) > _MOST_PIECES:  # of equal area each, then; too small to be cut
-        chosen = np.searchsorted(np.cumsum(areas) / areas.sum(), (np.arange(_MOST_PIECES) + 0.5) / _MOST_PIECES)
-        glowing, corners = glowing[chosen], _of_area(corners[chosen], areas.sum() / _MOST_PIECES)
-        areas = np.full(_MOST_PIECES, areas.sum() / _MOST_PIECES)
+    area = areas(corners)
+    kept = area > 0.0
+    glowing, corners, area = glowing[kept], corners[kept], area[kept]
+    if len(area) > _MOST_PIECES:  # of equal area each, then; too small to be cut
+        chosen = np.searchsorted(np.cumsum(area) / area.sum(), (np.arange(_MOST_PIECES) + 0.5) / _MOST_PIECES)
+        glowing, corners = glowing[chosen], _of_area(corners[chosen], area.sum() / _MOST_PIECES)
+        area = np.full(_MOST_PIECES, area.sum() / _MOST_PIECES)
     driven = world.materials.driven[geometry.material[rows][glowing]] >> Param.EMISSIVE.value & 1
-    cuts = np.clip(np.ceil(np.log(areas / areas.sum() * _PIECES) / math.log(4.0)), 0, _MOST_CUTS)
+    cuts = np.clip(np.ceil(np.log(area / area.sum() * _PIECES) / math.log(4.0)), 0, _MOST_CUTS)
     which, bary = _cut(np.where(driven != 0, cuts, 0).astype(np.int64))
     sides = np.matmul(
         np.stack([1.0 - bary.sum(axis=2), bary[:, :, 0], bary[:, :, 1]], axis=2), corners[which]
@@ -164,8 +165,7 @@ def _pieces(world: World, scene: Scene, part: int, emits: NDArray[np.bool_], eye
 def _of_area(corners: F64, area: float) -> F64:
     """Triangles of another area about the same middles."""
     middle = corners.mean(axis=1, keepdims=True)
-    now = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    grown: F64 = middle + (corners - middle) * np.sqrt(area / now)[:, None, None]
+    grown: F64 = middle + (corners - middle) * np.sqrt(area / areas(corners))[:, None, None]
     return grown
 
 
@@ -187,7 +187,7 @@ def _facets(world: World, part: int) -> _Pieces:
     """An exact sphere as 80 triangles around it, each of which has the emission of its one place. They touch it, for a
     shadow ray must end before it meets it."""
     ball = world.geometry.sphere[part].astype(np.float64)
-    corners = _ROUND * ball[3] + ball[:3]
+    corners = _round() * ball[3] + ball[:3]
     count = len(corners)
     bary = np.full((count, 3, 2), 1.0 / 3.0)
     return _Pieces(
@@ -195,8 +195,9 @@ def _facets(world: World, part: int) -> _Pieces:
     )
 
 
+@cache
 def _round() -> F64:
-    """Shape (80, 3, 3): an icosahedron, each face cut in four, around the unit sphere."""
+    """Shape (80, 3, 3): an icosahedron, each face cut in four, around the unit sphere and a little off it."""
     g = (1.0 + math.sqrt(5.0)) / 2.0
     places = np.array([(a, b * g, 0.0) for a in (-1, 1) for b in (-1, 1)])
     points = np.concatenate([np.roll(places, k, axis=1) for k in range(3)])
@@ -207,18 +208,12 @@ def _round() -> F64:
     ab, bc, ca = a + b, b + c, c + a
     faces = np.concatenate([np.stack(f, axis=1) for f in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
     faces /= np.linalg.norm(faces, axis=2, keepdims=True)
-    normals = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
+    normals = across(faces)
     turned = (normals * faces[:, 0]).sum(axis=1) < 0.0
     faces[turned] = faces[turned][:, ::-1]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    grown: F64 = faces / np.abs((normals * faces[:, 0]).sum(axis=1)).min()
+    grown: F64 = faces / np.abs((normals * faces[:, 0]).sum(axis=1)).min() * 1.0001
     return grown
-
-
-_ROUND = _round() * 1.0001
-_SHARE_OF_ROUND = 8.0 * math.pi / float(
-    np.linalg.norm(np.cross(_ROUND[:, 1] - _ROUND[:, 0], _ROUND[:, 2] - _ROUND[:, 0]), axis=1).sum()
-)
 
 
 def _lamp(world: World, part: int, radiance: F64) -> list[Light]:
@@ -239,7 +234,7 @@ def _light(kind: LightKind, radiance: F64, centre: F64, size: float) -> Light:
 
 def _lights(objects: list[_Pieces]) -> tuple[list[Light], list[GlowTree]]:
     """A light and its tree for each object, or for neighbours of one colour."""
-    light = [pieces.radiance * _areas(pieces.corner)[:, None] for pieces in objects]
+    light = [pieces.radiance * areas(pieces.corner)[:, None] for pieces in objects]
     power = np.array([flux.sum(axis=0) @ TEXEL_LUMINANCE for flux in light])
     kept = [k for k in np.argsort(-power, kind="stable") if power[k] > _FAINT * power.sum()]
     if len(kept) > _MOST_LIGHTS:
@@ -259,21 +254,16 @@ def _lights(objects: list[_Pieces]) -> tuple[list[Light], list[GlowTree]]:
         weight = radiance @ TEXEL_LUMINANCE
         shines = weight > 0.0
         corner, radiance, weight = corner[shines], radiance[shines], weight[shines]
-        area = _areas(corner)
+        area = areas(corner)
         colour = (radiance * area[:, None]).sum(axis=0) / (weight * area).sum()
         trees.append(_tree(corner, weight, area))
         lights.append(_light(LightKind.GLOW, colour, trees[-1].node[0, :3], 0.0))
     return lights, trees
 
 
-def _areas(corner: F64) -> F64:
-    areas: F64 = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
-    return areas
-
-
 def _tree(corner: F64, weight: F64, area: F64) -> GlowTree:
     """A whole binary tree over triangles along a curve through places and normals; leaves beyond the last are empty."""
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / (2.0 * area)[:, None]
+    normal = across(corner) / (2.0 * area)[:, None]
     middle = corner.mean(axis=1)
     order = _order(middle, normal)
     corner, weight, area, normal, middle = (column[order] for column in (corner, weight, area, normal, middle))
@@ -322,13 +312,7 @@ def _axes(corner: F64, middle: F64) -> F64:
 def _order(middle: F64, normal: F64) -> NDArray[np.int64]:
     """Along Morton's curve through normals and places: what is flat and near stands together."""
     low, size = middle.min(axis=0), max(float(np.ptp(middle, axis=0).max()), 1e-30)
-    digits = np.column_stack([(normal + 1.0) / 2.0, (middle - low) / size])
-    cells = np.minimum(digits * 1024.0, 1023.0).astype(np.int64)
-    code = np.zeros(len(middle), np.int64)
-    for bit in range(9, -1, -1):
-        for axis in range(6):
-            code = code << 1 | (cells[:, axis] >> bit & 1)
-    return np.argsort(code, kind="stable")
+    return by_halves(np.column_stack([(normal + 1.0) / 2.0, (middle - low) / size]))
 
 
 def _one(trees: list[GlowTree], starts: NDArray[np.int64]) -> GlowTree:

@@ -21,6 +21,18 @@ _FACES = 512
 """Faces of a mesh whose planes are looked at for convexity."""
 
 
+def across(corners: F64) -> F64:
+    """Normals of triangles, twice as long as their areas: shape (T, 3), of corners of shape (T, 3, 3)."""
+    normals: F64 = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return normals
+
+
+def areas(corners: F64) -> F64:
+    """Shape (T,), of corners of shape (T, 3, 3)."""
+    found: F64 = 0.5 * np.linalg.norm(across(corners), axis=1)
+    return found
+
+
 def signed_volume(points: F64, triangles: NDArray[np.integer]) -> float:
     """[cube of the unit], by the divergence theorem: positive where a closed surface faces outwards."""
     a, b, c = (points[triangles[:, side]] - points[triangles[0, 0]] for side in range(3))
@@ -30,8 +42,7 @@ def signed_volume(points: F64, triangles: NDArray[np.integer]) -> float:
 def mean_way(points: F64, triangles: NDArray[np.integer]) -> float:
     """Mean length of the ways through a closed surface, 4 V / S (Cauchy 1841), in its unit; 0 where it encloses
     nothing."""
-    a, b, c = (points[triangles[:, corner]] for corner in range(3))
-    surface = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2.0
+    surface = float(areas(points[triangles]).sum())
     return 4.0 * abs(signed_volume(points, triangles)) / surface if surface > 0.0 else 0.0
 
 
@@ -45,7 +56,7 @@ def is_convex(points: F64, triangles: NDArray[np.integer]) -> bool:
     is looked at."""
     faces = np.unique(np.linspace(0, len(triangles) - 1, _FACES).astype(np.int64))
     at = points[triangles[faces]]
-    normals = np.cross(at[:, 1] - at[:, 0], at[:, 2] - at[:, 0])
+    normals = across(at)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     if signed_volume(points, triangles) < 0.0:
         normals = -normals
@@ -79,11 +90,17 @@ def encloses(points: NDArray[np.floating], triangles: NDArray[np.integer], point
 def along_a_curve(points: F64) -> NDArray[np.int64]:
     """Order of points along Morton's curve: those next to each other are so in space, so that strata are, too."""
     low, size = points.min(axis=0), max(float(np.ptp(points, axis=0).max()), 1e-30)
-    cells = ((points - low) / size * 1023.0).astype(np.int64)
-    code = np.zeros(len(points), np.int64)
-    for bit in range(10):
-        for axis in range(3):
-            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return by_halves(((points - low) / size)[:, ::-1])
+
+
+def by_halves(columns: F64) -> NDArray[np.int64]:
+    """Order of rows by Morton's code of their columns, which are from 0 to 1: by the half that the first is in, then
+    the second, and so on, then by halves of those. Six columns at most."""
+    cells = np.minimum(columns * 1024.0, 1023.0).astype(np.int64)
+    code = np.zeros(len(columns), np.int64)
+    for bit in range(9, -1, -1):
+        for column in cells.T:
+            code = code << 1 | (column >> bit & 1)
     return np.argsort(code, kind="stable")
 
 

@@ -192,7 +192,7 @@ def pack_materials(materials: Sequence[Material], slots: dict[str, int], drawn_a
 def _spreads(material: Material) -> bool:
     """Not all of it is black."""
     source = material.inputs[Param.DIFFUSE]
-    return source.texture >= 0 or bool(source.primvar) or any(source.value[:3])
+    return source.driven or any(source.value[:3])
 
 
 def _gleams(material: Material) -> bool:
@@ -200,15 +200,15 @@ def _gleams(material: Material) -> bool:
 
     def least(param: Param) -> float:
         source = material.inputs[param]
-        return 0.0 if source.texture >= 0 or source.primvar else source.value[0]
+        return 0.0 if source.driven else source.value[0]
 
     metal = material.inputs[Param.METALLIC]
-    strong = material.specular_workflow or metal.texture >= 0 or bool(metal.primvar) or metal.value[0] > 0.1
+    strong = material.specular_workflow or metal.driven or metal.value[0] > 0.1
     return least(Param.ROUGHNESS) < (0.5 if strong else 0.2)
 
 
 def _driven(material: Material) -> int:
-    return sum(1 << i for i, source in enumerate(material.inputs) if source.texture >= 0 or source.primvar)
+    return sum(1 << i for i, source in enumerate(material.inputs) if source.driven)
 
 
 def primvar_slots(materials: Sequence[Material]) -> dict[str, int]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pxr import Usd, UsdGeom
 
 from ...scene import F32, F64, U32, Notice
-from ...world.solid import looks_inwards
+from ...world.solid import across, looks_inwards
 from . import gprims
 from .cages import (
     FINENESS,
@@ -405,9 +405,8 @@ def _any_of_face(corner_flags: NDArray[np.bool_], starts: Index, counts: Index) 
 
 def _agreement(normals: F32, rows: Index, points: F64, triangles: U32) -> float:
     """Sum of area times cosine between the faces and the normals at their corners: negative if most look against."""
-    around = points[triangles]
-    areas = np.cross(around[:, 1] - around[:, 0], around[:, 2] - around[:, 0])
-    return float(sum(np.einsum("ij,ij->", areas, normals[rows[:, corner]]) for corner in range(3)))
+    faces = across(points[triangles])
+    return float(sum(np.einsum("ij,ij->", faces, normals[rows[:, corner]]) for corner in range(3)))
 
 
 def _compact(points: F32, vertices: Index) -> tuple[F32, Index]:
@@ -458,7 +457,7 @@ def _mended(normals: Corners | None, points: F32, triangles: Index) -> Corners |
     at = bad[normals.rows]
     rows = np.flatnonzero(at.any(axis=1))
     around = points[triangles[rows]].astype(np.float64)
-    flat = np.cross(around[:, 1] - around[:, 0], around[:, 2] - around[:, 0])
+    flat = across(around)
     flat /= np.linalg.norm(flat, axis=1, keepdims=True)
     picks = normals.rows.copy()
     picks[rows] = np.where(at[rows], len(unit) + np.arange(len(rows))[:, None], picks[rows])

@@ -9,6 +9,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
 from ...scene import Material, Mesh, Notice, Param, Source, prim_of
+from ...world.solid import areas
 from .context import Context, note, value
 from .emission import emission
 
@@ -69,8 +70,7 @@ def _lit(context: Context, mesh: Mesh, light: Usd.Prim | None, materials: list[M
     found = emission(context, UsdLux.LightAPI(light)) if light is not None else None
     if light is None or found is None or not len(mesh.triangles):
         return mesh
-    a, b, c = (mesh.points.astype(np.float64)[mesh.triangles[:, k]] for k in range(3))
-    area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2.0
+    area = float(areas(mesh.points.astype(np.float64)[mesh.triangles]).sum())
     factor = 1.0
     if value(context, light, "inputs:normalize", False):
         if area <= 0.0:

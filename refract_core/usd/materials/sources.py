@@ -66,7 +66,7 @@ def constant(value: Value) -> Source:
 
 def is_constant(source: Source) -> bool:
     """Neither a texture nor a primvar drives it."""
-    return source.texture < 0 and not source.primvar
+    return not source.driven
 
 
 def scaled(source: Source, factor: float | Four, offset: float | Four = 0.0) -> Source:

@@ -12,7 +12,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from ...scene import F64, U32, Material, Model, Notice, Param, Texture
 from ...settings import PURPOSES
-from ...world.solid import signed_volume
+from ...world.solid import across, signed_volume
 from ..convert.find import editable, find_glass, original
 from ..diagnostics import captured
 from ..geometry.parts import Bound, bind
@@ -296,7 +296,7 @@ def _flaw(shape: Shape) -> str:
 def _normals(shape: Shape, corners: F64, linear: F64, mirrored: bool) -> F64:
     """Unit normals per triangle corner, shape (T, 3, 3). `corners`: shape (T, 3, 3), the triangles' own, turned."""
     if shape.normals is None:
-        flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        flat = across(corners)
         flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)
         return np.repeat(flat[:, None], 3, axis=1)
     turned = shape.normals.values.astype(np.float64) @ np.linalg.inv(linear)
