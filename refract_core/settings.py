@@ -11,6 +11,7 @@ from .models import MODELS as MODELS
 
 TIERS = ("screen", "ray", "probe", "sky")
 SCREEN_METHODS = ("march", "proxy", "traced")
+INDIRECT = ("off", "one", "full")
 QUALITIES: dict[str, dict[str, Any]] = {
     "draft": {"samples": 4, "tolerance": 0.1, "cut": 0.05, "light_samples": 16, "caustics": 0},
     "good": {"samples": 16, "tolerance": 0.03, "cut": 0.02, "light_samples": 16, "caustics": 1 << 16},
@@ -76,6 +77,8 @@ class RenderSettings:
     caustics: int = 1 << 16
     """Photons that bring light through traced glass, and off it, to what is opaque, 0 .. 16777216. 0: light goes
     straight through glass on its way, as it does through panes and all other models."""
+    indirect: str = "off"
+    """Light that opaque surfaces send each other: `off`, `one` for the first time that it is, `full` for all."""
     exposure: float = 0.0
     """Stops added to the camera's own exposure, -64 .. 64."""
     purposes: tuple[str, ...] = ("default", "render")
@@ -113,6 +116,7 @@ class RenderSettings:
         _tokens("tiers", self.tiers, TIERS)
         _tokens("purposes", self.purposes, PURPOSES)
         _tokens("screen", (self.screen,), SCREEN_METHODS)
+        _tokens("indirect", (self.indirect,), INDIRECT)
         if self.model:
             _tokens("model", (self.model,), MODELS)
 

@@ -54,6 +54,7 @@ class RenderSettings(TypedDict, total=False):
     tolerance: float
     light_samples: int
     caustics: int
+    indirect: str
     cut: float
     tiers: list[str]
     screen: str

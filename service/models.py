@@ -71,6 +71,7 @@ class Render(StageOnly):
     tolerance: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
     light_samples: Annotated[int, Field(ge=1, le=4096)] | None = None
     caustics: Annotated[int, Field(ge=0, le=1 << 24, description="photons through glass; 0 is none")] | None = None
+    indirect: Literal["off", "one", "full"] | None = None
     cut: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
     tiers: Annotated[list[Tier], Field(min_length=1, max_length=4), _Once] | None = None
     screen: Literal["march", "proxy", "traced"] | None = None

@@ -40,8 +40,8 @@ _CUT_OFF = "the package has no directory at its end, so it was cut off"
 _UNITS = ("Z", "thickness", "path_length", "layers")
 """Planes that are not between 0 and 1: their PNG is scaled, and says by how much."""
 _SETTINGS = ("camera", "image_width", "image_height", "quality", "preset", "samples", "tolerance", "light_samples",
-             "caustics", "cut", "tiers", "screen", "model", "max_layers", "exposure", "camera_light", "emission_light",
-             "purposes")  # fmt: skip
+             "caustics", "indirect", "cut", "tiers", "screen", "model", "max_layers", "exposure", "camera_light",
+             "emission_light", "purposes")  # fmt: skip
 
 
 def laid_out(stage: str, root: str, settings: Mapping[str, Any], limits: Mapping[str, int]) -> tuple[str, str]:

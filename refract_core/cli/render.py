@@ -89,6 +89,14 @@ Caustics = Annotated[
         "has, lets light go straight through glass, tinted. The default is 65536, at best 262144.",
     ),
 ]
+Indirect = Annotated[
+    str | None,
+    typer.Option(
+        metavar="off|one|full",
+        help="Light that opaque surfaces send each other: none, which is the default, what they send on once, or all. "
+        "A room whose light comes by its walls is dark without it.",
+    ),
+]
 Tiers = Annotated[
     str | None,
     typer.Option(
@@ -206,6 +214,7 @@ def render(
     tolerance: Tolerance = None,
     light_samples: LightSamples = None,
     caustics: Caustics = None,
+    indirect: Indirect = None,
     cut: Cut = None,
     tiers: Tiers = None,
     screen: Screen = None,
@@ -238,6 +247,7 @@ def render(
             "tolerance": tolerance,
             "light_samples": light_samples,
             "caustics": None if caustics is None else _photons(caustics, quality or ""),
+            "indirect": indirect,
             "cut": cut,
             "tiers": None if tiers is None else words(tiers),
             "screen": screen,

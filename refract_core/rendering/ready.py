@@ -32,6 +32,7 @@ from ..world.tables import (
     world_of,
 )
 from .caustics import caustics_of, plan_caustics, with_caustics
+from .indirect import indirect_of
 from .session import Session
 from .work import Cancel, Progress, Work, working
 
@@ -89,8 +90,8 @@ def prepare(
 
 
 def prepare_bare(scene: Scene, camera: Camera, settings: RenderSettings, work: Work) -> Ready:
-    """A scene made ready to be drawn without any probes and caustics."""
-    bare = replace(settings, caustics=0)
+    """A scene made ready to be drawn without any probes, caustics and indirect light."""
+    bare = replace(settings, caustics=0, indirect="off")
     return _prepare(scene, camera, plan_capture(scene, []), bare, False, 1, work, (0.0, 0.0))
 
 
@@ -109,7 +110,8 @@ def _prepare(
     images, sky = textures.pack(scene.textures), environment.pack(scene.environment)
     plain = _lit(scene, camera, settings, geometry, pack_materials(scene.materials, slots, settings.model), images, sky)
     thrown = caustics_of(plain, scene, plan_caustics(plain, camera, settings), work)
-    world = by_address(with_caustics(plain, thrown))
+    lit = with_caustics(plain, thrown)
+    world = by_address(lit._replace(bounced=indirect_of(lit, camera, settings, work)))
     entries = chosen.entries
     table = empty_table([e.probe for e in entries], [e.drawn for e in entries], camera, rough)
     work.progress(span[0], "probes")
@@ -175,12 +177,17 @@ def _from_parts(
     wanted_light = plan_caustics(plain, camera, settings)
     seen = hierarchy.number, images.number, sky.number, tuple(plain.lights), scene.materials, settings.model
     thrown = session.part("caustics", (*seen, wanted_light), lambda: caustics_of(plain, scene, wanted_light, work))
-    world = by_address(with_caustics(plain, thrown.made))
+    lit = with_caustics(plain, thrown.made)
+    looked_at: Any = None
+    if settings.indirect != "off":
+        looked_at = *seen, thrown.number, camera, settings.image_width, settings.image_height, settings.indirect
+    sent_on = session.part("indirect", looked_at, lambda: indirect_of(lit, camera, settings, work))
+    world = by_address(lit._replace(bounced=sent_on.made))
 
     rough = is_rough(scene)
     drawn = [entry for entry in chosen.entries if entry.drawn]
     # Probes that do not see glass still see what has come through it.
-    shown = *seen, thrown.number, rough, samples
+    shown = *seen, thrown.number, sent_on.number, rough, samples
     # A probe that sees glass is drawn as a picture is, from the scene itself; how the work is cut up never changes it.
     asked = replace(settings, jobs=0, tile_size=64)
     glassy = asked, scene.bounds, scene.metres_per_unit

@@ -2,4 +2,4 @@
 planes.
 """
 
-__all__ = ["camera", "gbuffer", "planes", "pyramid", "quiet", "screen"]
+__all__ = ["camera", "gbuffer", "places", "planes", "pyramid", "quiet", "screen"]

@@ -26,7 +26,7 @@ from ..world.embree import COHERENT, EVERYTHING, OPAQUE, clear, has_hit
 from ..world.shading import (
     LOBES,
     Block,
-    add_caustics,
+    add_indirect,
     add_light,
     add_light_ray,
     add_sky,
@@ -134,7 +134,7 @@ def quiet_tile(
     for y in range(y0, y1):
         for x in range(x0, x1):
             if scratch.part[_place(x - x0, y - y0)] >= 0:
-                add_caustics(scratch.places, _place(x - x0, y - y0), world)
+                add_indirect(scratch.places, _place(x - x0, y - y0), world)
     _send(scratch, world, view, care, layer, x0, y0, x1, y1)
     return packet.tally[0], glass
 

@@ -22,6 +22,7 @@ from ..kernels.compile import inlined, kernel
 from ..kernels.vec import Vec, along, dot, length, row
 from ..scene import F32
 from .environment import TEXEL_LUMINANCE
+from .hashing import EMPTY, claim, is_full, slot_of
 
 LEVELS = 12
 """Sizes of texels, each half of the one before."""
@@ -30,7 +31,6 @@ _MARK = 15
 _AXIS_SHARE = 0.4
 """Cosine to an axis from which on a photon is written for those who look along it, and a place looks along it; of three
 one always has .57."""
-_EMPTY = -1
 _COLUMNS = 19
 """Bits of a column's or row's number, of which 21 bits are left to a layer, a side and a level."""
 _LAYERS = 16
@@ -63,7 +63,7 @@ def no_caustics() -> Caustics:
 def new_caustics(slots: int, texel: F64_1D) -> Caustics:
     """An empty table. `slots`: a power of two."""
     flux: F32 = np.zeros((slots, 3), np.float32)
-    keys, marks = np.full(slots, _EMPTY, np.int64), np.zeros(slots, np.int32)
+    keys, marks = np.full(slots, EMPTY, np.int64), np.zeros(slots, np.int32)
     return Caustics(keys, flux, marks, texel, np.full(3, math.inf), np.full(3, -math.inf))
 
 
@@ -98,7 +98,7 @@ class Tally(NamedTuple):
 def new_tally(slots: int) -> Tally:
     """An empty one. `slots`: a power of two."""
     light, squares, number = (np.zeros(slots, np.float32) for _ in range(3))
-    return Tally(np.full(slots, _EMPTY, np.int64), light, squares, number, np.zeros((slots, 3), np.float32))
+    return Tally(np.full(slots, EMPTY, np.int64), light, squares, number, np.zeros((slots, 3), np.float32))
 
 
 # --- addresses ----------------------------------------------------------------------------------------------------
@@ -119,32 +119,6 @@ def _key(level: int, side: int, column: int, line: int, layer: int) -> int:
     most, layers = (1 << _COLUMNS) - 1, (1 << _LAYERS) - 1
     head = np.int64(level) * 16 + side
     return int(((head << _LAYERS | (layer & layers)) << _COLUMNS | (column & most)) << _COLUMNS | (line & most))
-
-
-@inlined
-def _slot(keys: I64_1D, key: int) -> int:
-    """Where a key is, or the free slot where it belongs (linear probing)."""
-    last = keys.shape[0] - 1
-    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
-    i = np.int64(mixed >> np.uint64(24)) & last
-    while keys[i] != _EMPTY and keys[i] != key:
-        i = (i + 1) & last
-    return int(i)
-
-
-@inlined
-def _claim(keys: I64_1D, key: int) -> tuple[int, int]:
-    """The slot of a key, which is its own from now on; and 1 if it was free."""
-    slot = _slot(keys, key)
-    new = 1 if keys[slot] == _EMPTY else 0
-    keys[slot] = key
-    return slot, new
-
-
-@inlined
-def _is_full(keys: I64_1D, filled: int) -> bool:
-    """Half of a table's slots are taken, from where on finding a key takes long; then it is of no use."""
-    return 2 * filled > keys.shape[0]
 
 
 @inlined
@@ -177,9 +151,9 @@ def count_photons(tally: Tally, landings: Landings, texel: float, levels: I32_1D
         axis = _main_axis(n)
         u, v, w = _coordinates(row(landings.point, k), axis, texel)
         side = _side_of(n, axis) + 8 * landings.kind[k]
-        slot, new = _claim(tally.keys, _key(level, side, math.floor(u), math.floor(v), math.floor(w)))
+        slot, new = claim(tally.keys, _key(level, side, math.floor(u), math.floor(v), math.floor(w)))
         filled += new
-        if _is_full(tally.keys, filled):
+        if is_full(tally.keys, filled):
             return False
         light = dot(row(landings.flux, k), TEXEL_LUMINANCE)
         tally.light[slot] += light
@@ -218,7 +192,7 @@ def raise_levels(
         mean = (0.0, 0.0, 0.0)
         for i in range(-1, 2):
             for j in range(-1, 2):
-                slot = _slot(tally.keys, _key(level, side, column + i, line + j, layer))
+                slot = slot_of(tally.keys, _key(level, side, column + i, line + j, layer))
                 share = _FILTER[i + 1] * _FILTER[j + 1]
                 light += share * tally.light[slot]
                 squares += share * tally.squares[slot]
@@ -250,10 +224,10 @@ def add_photons(table: Caustics, landings: Landings, levels: I32_1D) -> bool:
                 i, j = corner % 2, corner // 2
                 share = (s if i else 1.0 - s) * (t if j else 1.0 - t)
                 key = _key(levels[k], _side_of(n, axis), column + i, line + j, math.floor(w))
-                slot, new = _claim(table.keys, key)
+                slot, new = claim(table.keys, key)
                 if new != 0:
                     filled += 1 + _mark(table, column + i, line + j, w, _side_of(n, axis), levels[k])
-                    if _is_full(table.keys, filled):
+                    if is_full(table.keys, filled):
                         return False
                 for c in range(3):
                     table.flux[slot, c] += share * landings.flux[k, c]
@@ -271,7 +245,7 @@ def _mark(table: Caustics, column: int, line: int, w: float, side: int, level: i
     for i in range(math.floor(u - reach), math.floor(u + reach) + 1):
         for j in range(math.floor(v - reach), math.floor(v + reach) + 1):
             for k in range(math.floor(w - 1.5 * share), math.floor(w + 1.5 * share) + 1):
-                slot, new = _claim(table.keys, _key(_MARK, side, i, j, k))
+                slot, new = claim(table.keys, _key(_MARK, side, i, j, k))
                 marked += new
                 table.marks[slot] |= 1 << level
     return marked
@@ -307,7 +281,7 @@ def _seen_along(table: Caustics, p: Vec, n: Vec, axis: int) -> Vec:
     r = g = b = 0.0
     side = _side_of(n, axis)
     u, v, w = _coordinates(p, axis, table.texel[0])
-    mark = _slot(table.keys, _key(_MARK, side, math.floor(u), math.floor(v), math.floor(w)))
+    mark = slot_of(table.keys, _key(_MARK, side, math.floor(u), math.floor(v), math.floor(w)))
     for level in range(table.texel.shape[0]):
         if (table.marks[mark] >> level) & 1 == 0:
             continue
@@ -321,8 +295,8 @@ def _seen_along(table: Caustics, p: Vec, n: Vec, axis: int) -> Vec:
             for j in range(4):
                 share = scale * across * _blur(j, t)
                 for k in range(-1, 2):
-                    slot = _slot(table.keys, _key(level, side, column + i - 1, line + j - 1, layer + k))
-                    if table.keys[slot] != _EMPTY:
+                    slot = slot_of(table.keys, _key(level, side, column + i - 1, line + j - 1, layer + k))
+                    if table.keys[slot] != EMPTY:
                         r += share * table.flux[slot, 0]
                         g += share * table.flux[slot, 1]
                         b += share * table.flux[slot, 2]

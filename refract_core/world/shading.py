@@ -19,6 +19,7 @@ from ..kernels.vec import Vec, add, along, dot, flip_towards, lerp, mul, normali
 from ..optics.interface import f0_from_ior
 from ..optics.lobes import MIRROR_ALPHA, sample_cosine, sample_half_vector, specular_albedo
 from ..scene import Param
+from .bounced import bounced_light
 from .caustics import caustic_irradiance
 from .embree import SCATTERED, Packet, clear, has_hit, ray_direction, set_ray
 from .environment import TEXEL_LUMINANCE, EnvironmentTable, direction_pdf, irradiance, prefiltered, sample_direction
@@ -528,15 +529,19 @@ def gather(block: Block, packet: Packet, world: World, mask: int) -> None:
     for lane in range(LANES):
         forget_light(block, lane)
         if block.on[lane] != 0 and block.matte[lane] != 0:
-            add_caustics(block, lane, world)
+            add_indirect(block, lane, world)
     _gather_lights(block, packet, world, mask)
     _gather_sky(block, packet, world, mask)
 
 
 @inlined
-def add_caustics(block: Block, lane: int, world: World) -> None:
-    """Add the light that comes through glass, or off it."""
-    e = caustic_irradiance(world.caustics, row(block.point, lane), row(block.ng, lane))
+def add_indirect(block: Block, lane: int, world: World) -> None:
+    """Add the light that comes through glass, or off it, and what opaque surfaces send each other."""
+    p, ng = row(block.point, lane), row(block.ng, lane)
+    e = caustic_irradiance(world.caustics, p, ng)
+    if world.bounced.cell.shape[0] > 0:
+        bounced, _ = bounced_light(world.bounced, p, ng, row(block.ns, lane))
+        e = along(e, bounced, block.occlusion[lane])
     put(block.diffuse, lane, add(row(block.diffuse, lane), e))
 
 

@@ -13,6 +13,7 @@ from ..kernels.arrays import F32_1D, F32_2D, F32_3D, I32_1D, I32_2D, I32_3D, I64
 from ..models import BY_TOKEN
 from ..scene import LightKind, Material, Mesh, Model, Param, Scene, Source, Sphere, prim_of
 from . import embree
+from .bounced import Bounced, no_bounced
 from .caustics import Caustics, no_caustics
 from .embree import (
     CASTER_SHIFTS,
@@ -122,6 +123,7 @@ class World(NamedTuple):
     environment: EnvironmentTable
     glass: GlassShade
     caustics: Caustics
+    bounced: Bounced
     cutouts: bool
     """Some material is a cut-out, so that hits must be looked at."""
     lit: bool
@@ -144,7 +146,8 @@ def world_of(
     glass = GlassShade(np.zeros(len(geometry.thing), np.uint8), walked)
     cutouts = bool(materials.cutout.any())
     gleams = bool(((lights.specular > 0.0) & (lights.kind != LightKind.CAMERA)).any())
-    return World(geometry, materials, textures, lights, environment, glass, no_caustics(), cutouts, lit, gleams)
+    arrived = no_caustics(), no_bounced()
+    return World(geometry, materials, textures, lights, environment, glass, *arrived, cutouts, lit, gleams)
 
 
 def pack_materials(materials: Sequence[Material], slots: dict[str, int], drawn_as: str) -> MaterialTable:
