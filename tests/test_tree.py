@@ -459,3 +459,41 @@ def test_a_ray_that_is_caught_is_let_out() -> None:
     caught = (planes["mask"] > 0) & (planes["confidence"] < 0.5) & planes["refraction"].any(-1)
     assert caught.any()
     np.testing.assert_allclose(planes["beauty"][..., :3], 0.75, atol=1e-4)
+
+
+# --- Lamps, which no ray meets, mirrored in glass ---------------------------------------------------------------------
+
+
+def before_lamp(kind: LightKind, behind: bool, things: Sequence[Mesh], kinds: Sequence[Material]) -> F32:
+    """What the middle pixel shows of a wide lamp of radiance 2, behind the camera or beyond the glass."""
+    size = {LightKind.RECT: (6.0, 6.0), LightKind.DISTANT: (2.0, 0.0)}.get(kind, (3.0, 0.0))
+    away = 8.0 if behind else -8.0
+    lamp = light(kind, (0, 0, away), (0, 0, -away), size, 2.0)
+    seen: F32 = middle(scene(things, kinds, lights=(lamp,), cameras=(STRAIGHT,)), cut=WHOLE)["beauty"][:3]
+    return seen
+
+
+@pytest.mark.parametrize("kind", [LightKind.RECT, LightKind.DISK, LightKind.SPHERE, LightKind.DISTANT])
+def test_both_sides_of_a_slab_mirror_a_lamp(kind: LightKind) -> None:
+    """Of what shines straight through none is seen, as lamps are not drawn; of what is mirrored on the way all is."""
+    things, kinds = [slab("slab", 0.2, -0.2, 0)], [tinted(1.5, 0.5)]
+    whole = stacked(face(1, 1.5), depth(0.5, 0.4), face(1.5, 1))
+    np.testing.assert_allclose(before_lamp(kind, True, things, kinds), 2.0 * whole.front, rtol=1e-4)
+    straight = face(1, 1.5).through * face(1.5, 1).through * depth(0.5, 0.4).through
+    np.testing.assert_allclose(before_lamp(kind, False, things, kinds), 2.0 * (whole.through - straight), rtol=1e-4)
+
+
+def test_what_stands_before_a_lamp_hides_its_mirror_picture() -> None:
+    things = [slab("slab", 0.2, -0.2, 0), quad("/wall", [(-4, -4, 5), (4, -4, 5), (4, 4, 5), (-4, 4, 5)], 1)]
+    seen = before_lamp(LightKind.RECT, True, things, [glass(Model.TRACED, 1.5), material("/black")])
+    np.testing.assert_allclose(seen, 0.0, atol=1e-6)
+
+
+def test_a_lamp_shows_in_glass_whose_prim_it_lights_alone() -> None:
+    lamp = light(LightKind.RECT, (0, 0, 8.0), (0, 0, -1), (6.0, 6.0), 2.0)
+    things, kinds = [slab("slab", 0.2, -0.2, 0)], [glass(Model.TRACED, 1.5)]
+    for links, shows in ((None, True), (("/slab",), True), (("/other",), False)):
+        linked = scene(things, kinds, lights=(replace(lamp, lit=links),), cameras=(STRAIGHT,))
+        seen = middle(linked, cut=WHOLE)["beauty"][:3]
+        assert (seen > 0.01).all() == shows
+        assert (seen > 0.0).any() == shows

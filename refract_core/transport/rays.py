@@ -99,6 +99,9 @@ class Rays(NamedTuple):
     """surfaces that it has entered"""
     met: I32_1D
     """pieces of glass that it has met, passed ones too"""
+    lamps: I32_1D
+    """1 where it sees lamps: it has been mirrored inside of glass, and since then by no outside, whose highlights are
+    the lamps' mirror pictures already"""
     media: Media
 
 
@@ -149,7 +152,7 @@ def copy_ray(to: Rays, i: int, rays: Rays, j: int) -> None:
     to.inner[i], to.pixel[i], to.branch[i] = rays.inner[j], rays.pixel[j], rays.branch[j]
     to.way[i] = rays.way[j]
     to.channel[i], to.side[i], to.thing[i] = rays.channel[j], rays.side[j], rays.thing[j]
-    to.entered[i], to.met[i] = rays.entered[j], rays.met[j]
+    to.entered[i], to.met[i], to.lamps[i] = rays.entered[j], rays.met[j], rays.lamps[j]
     to.media.depth[i] = rays.media.depth[j]
     for k in range(rays.media.depth[j]):
         _copy_medium(to.media, i, k, rays.media, j, k)

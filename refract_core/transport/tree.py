@@ -22,9 +22,11 @@ from ..scene import Model
 from ..view.camera import View, pixel_ray
 from ..world.embree import COHERENT, EVERYTHING, OPAQUE, SCATTERED, Packet, clear, has_hit, set_ray
 from ..world.environment import TEXEL_LUMINANCE, radiance
+from ..world.lights import lamp_ahead
 from ..world.offsets import tie
 from ..world.shading import LOBES, Block, gather, load_surface
-from ..world.surface import NOTHING, HitLanes, Ray, hit_in, interaction, keep_hit, kept_hit
+from ..world.shaping import shape_drawn
+from ..world.surface import NOTHING, Hit, HitLanes, Ray, hit_in, interaction, keep_hit, kept_hit
 from ..world.tables import World
 from ..world.tracing import belongs_to, intersect_world
 from .answers import Answers, add_answer, add_glow, new_answers
@@ -305,6 +307,8 @@ def _meet_all(scratch: TreeScratch, world: World, view: View, rules: Rules, take
         scratch.block.on[lane] = 0
     for lane in range(taken):
         hit = kept_hit(met, lane)
+        if now.lamps[lane] != 0 and now.blur[lane] <= 0.0 and _see_lamp(scratch, world, lane, hit):
+            continue
         if hit.part == NOTHING:
             if now.inner[lane] != 0:
                 absorb(now, lane, now.end[lane])
@@ -343,6 +347,27 @@ def _meet_all(scratch: TreeScratch, world: World, view: View, rules: Rules, take
         cross(meeting, lane, now, rules)
         if scratch.block.on[lane] != 0:
             put(scratch.block.fresnel, lane, row(meeting.reflectance, lane))  # of lamps, too, exactly
+
+
+@inlined
+def _see_lamp(scratch: TreeScratch, world: World, lane: int, hit: Hit) -> bool:
+    """End a ray at the first lamp that it meets before anything else, and add its light. Whether there is one."""
+    now, lights = scratch.now, world.lights
+    p, d = row(now.origin, lane), row(now.direction, lane)
+    nearest, which = now.end[lane] if hit.part == NOTHING else hit.t, -1
+    for l in range(lights.kind.shape[0]):  # noqa: E741
+        t = lamp_ahead(lights, l, p, d)
+        lit = lights.link[l] < 0 or lights.linked[lights.link[l], now.thing[lane]] != 0
+        if now.start[lane] < t < nearest and lights.specular[l] > 0.0 and lit:
+            nearest, which = t, l
+    if which < 0:
+        return False
+    absorb(now, lane, nearest)
+    light = scale(mul(row(now.weight, lane), row(lights.radiance, which)), lights.specular[which])
+    if lights.even[which] == 0:
+        light = mul(light, shape_drawn(lights, which, p, d, nearest))
+    _glow(scratch, now.pixel[lane], light, now.side[lane], now.way[lane], 3 + which)
+    return True
 
 
 @inlined

@@ -31,6 +31,8 @@ _ARC_SIDES = 8
 """Straight pieces that the seen half of a cylinder's end is made of."""
 _SMALLEST_POINT_LOBE = 0.02
 """GGX width [alpha] below which a light without size is not sharpened: it would be an infinitely bright dot."""
+_BEYOND = 1e30
+"""[m] how far away distant lights are."""
 _NEAREST2 = 1e-12
 """[m^2] squared distance that a light counts as having at least, so that nothing is divided by 0."""
 
@@ -194,6 +196,18 @@ def highlight(lights: LightTable, which: int, p: Vec, n: Vec, wo: Vec, alpha: fl
             lobe = ggx(dot(n, h), a) * (a / wide) ** 2 * smith_visibility(n_dot_v, n_dot_l, a)
             value += (1.0 - sharp) * lobe * n_dot_l * solid
     return value
+
+
+@inlined
+def lamp_ahead(lights: LightTable, which: int, p: Vec, d: Vec) -> float:
+    """How far away a ray from `p` along unit `d` meets a light's own shape, from the side that it shines to [m]; inf
+    where it does not, or the light has no size. A round one stands where the ray is nearest to its middle."""
+    if lights.size[which, 0] <= 0.0:
+        return math.inf
+    point, inside, solid, _ = nearest_to(lights.kind[which], lamp_of(lights, which), p, d)
+    if not inside or solid <= 0.0:
+        return math.inf
+    return _BEYOND if lights.kind[which] == LightKind.DISTANT.value else length(point)
 
 
 # --- shadow targets -------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from refract_core.scene import LightKind, Scene, Shadow, Shaping
 
 from . import shaping
-from .vec import Vec, add, at, basis, clamp, cross, dot, length, mix, scaled, sub, unit, vec
+from .vec import Vec, add, at, basis, clamp, cross, dot, length, mix, mul, scaled, sub, unit, vec
 
 _DISK_CORNERS = 12
 """A disk's diffuse light is that of the regular polygon with its area."""
@@ -128,6 +128,35 @@ def mirrored_tint(lamp: Lamp, p: Vec, n: Vec, wo: Vec, alpha: float) -> Vec:
     axes = (lamp.x, lamp.y, lamp.face)
     off = sub(near.to, sub(lamp.centre, p))
     return shaping.mirrored(lamp.shaping, half, axes, near.to, off, alpha, near.radius)
+
+
+def distance_to(lamp: Lamp, p: Vec, d: Vec) -> float:
+    """Where a ray meets the shape of a lamp that has a size, on the side that shines; inf where it does not."""
+    if lamp.kind is None or lamp.size[0] == 0.0:
+        return math.inf
+    if lamp.kind is LightKind.DISTANT:
+        return 1e29 if dot(d, lamp.face) < 0.0 and length(cross(d, lamp.face)) <= math.sin(lamp.size[0]) else math.inf
+    if lamp.kind is LightKind.CYLINDER:
+        near = _nearest_of_cylinder(lamp, p, d)
+        return length(near.to) if near.inside else math.inf
+    c = sub(lamp.centre, p)
+    if lamp.kind is LightKind.SPHERE:
+        return dot(c, d) if dot(c, d) > 0.0 and length(cross(c, d)) <= lamp.size[0] else math.inf
+    slope = dot(d, lamp.face)
+    if slope >= -1e-6 or dot(c, lamp.face) >= 0.0:
+        return math.inf
+    t = dot(c, lamp.face) / slope
+    off = sub(scaled(d, t), c)
+    a, b = dot(off, lamp.x), dot(off, lamp.y)
+    on_it = abs(a) <= lamp.size[0] and abs(b) <= lamp.size[1]
+    if lamp.kind is LightKind.DISK:
+        on_it = math.hypot(a, b) <= lamp.size[0]
+    return t if on_it else math.inf
+
+
+def seen(lamp: Lamp, p: Vec, d: Vec) -> Vec:
+    """The radiance that a ray from `p` meets there."""
+    return scaled(mul(lamp.radiance, mirrored_tint(lamp, p, d, d, 0.0)), lamp.specular)
 
 
 # --- Diffuse --------------------------------------------------------------------------------------------------------

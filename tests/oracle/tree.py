@@ -14,7 +14,7 @@ from typing import NamedTuple
 from refract_core.scene import Model, Param
 from refract_core.settings import RenderSettings
 
-from . import optics, sampling
+from . import lights, optics, sampling
 from .media import (
     MOST,
     Media,
@@ -101,6 +101,10 @@ class Ray(NamedTuple):
     roughness: float = 0.0
     entered: int = 0
     met: int = 0
+    lamps: bool = False
+    """it has been mirrored in glass, and sees them"""
+    thing: int = -1
+    """that it entered last"""
     way: float = 0.0
     """inside media, so far [m]"""
     travelled: float = 0.0
@@ -198,6 +202,8 @@ class Tree:
             self._end(ray, None, view, grown, lost=True)
             return []
         hit = self._met(ray, view)
+        if ray.lamps and ray.blur <= 0.0 and self._lit(ray, hit, grown):
+            return []
         if hit is None and ray.inner is not None:
             return [_out(ray.absorb(ray.far), ray.inner)]
         if hit is None or hit.face.kind == OPAQUE:
@@ -218,6 +224,18 @@ class Tree:
         if choice.step is not Step.LEAVES:
             ray = ray._replace(media=_still_in(ray))
         return self._split(ray, hit, choice, view, grown)
+
+    def _lit(self, ray: Ray, hit: Hit | None, grown: Grown) -> bool:
+        """A lamp ends the ray before anything else does."""
+        path = self.shader.path_of(ray.thing)
+        seen = [lamp for lamp in self.shader.lamps if lamp.specular > 0.0 and (lamp.lit is None or path in lamp.lit)]
+        far = [(lights.distance_to(lamp, ray.origin, ray.direction), k) for k, lamp in enumerate(seen)]
+        t, k = min(far, default=(math.inf, -1))
+        if not ray.start < t < (ray.far if hit is None else hit.t):
+            return False
+        ray = ray.absorb(t)
+        grown.gain(ray.side, mul(ray.weight, lights.seen(seen[k], ray.origin, ray.direction)))
+        return True
 
     # --- What it meets ---
 
@@ -323,7 +341,10 @@ class Tree:
             child = self._follower(ray, hit.t, s, back, sampling.GLANCED)
             blur = math.hypot(ray.blur, 2.0 * s.roughness**2)
             entered = ray.entered + (step is not Step.LEAVES)
-            rays.append(_beside(child._replace(direction=optics.glanced(d, s.ns, s.ng), blur=blur, entered=entered), s))
+            child = child._replace(direction=optics.glanced(d, s.ns, s.ng), blur=blur, entered=entered)
+            if step is not Step.LEAVES:
+                child = child._replace(thing=hit.face.thing)
+            rays.append(_beside(child._replace(lamps=step is Step.LEAVES), s))
         return rays
 
     def _of_channel(self, ray: Ray, s: Surface, step: Step, eta: float) -> Split:
@@ -378,7 +399,9 @@ class Tree:
             return _beside(child._replace(direction=bent, media=choice.behind), s)
         assert body is not None
         rough = 2.0 * optics.transmitted_roughness(s.roughness, body.ior) ** 2
-        child = child._replace(blur=math.hypot(child.blur, rough), entered=child.entered + 1)
+        child = child._replace(
+            blur=math.hypot(child.blur, rough), entered=child.entered + 1, thing=hit.face.thing
+        )
         if step is Step.ENTERS:
             assert bent is not None
             return _beside(child._replace(direction=bent, media=choice.behind), s)
