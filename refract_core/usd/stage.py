@@ -19,6 +19,7 @@ from ..scene import F64, Mesh, Notice, Scene, Sphere, prim_of
 from .camera import choose_camera, read_cameras
 from .diagnostics import captured, words_of
 from .geometry.cages import FINENESS
+from .geometry.curves import cuts_for
 from .geometry.parts import MOST_IN_ALL, Bound, Part, Tables, affordable, assemble, bind
 from .geometry.place import Placed, bounds_of, place, to_mesh, to_sphere
 from .geometry.refined import MOST_TRIANGLES, Fineness
@@ -307,6 +308,7 @@ def _placed(placements: list[Placement], metres_from_stage: F64, tables: Tables)
     prims = list({placement.prim.GetPath(): placement.prim for placement in placements}.values())
     shapes: dict[Sdf.Path, Shape | None] = {}
     parts: dict[Sdf.Path, Part | None] = {}
+    tables.cuts = cuts_for(placements, tables.time, tables.fineness, tables.notices)
     asked, tables.fineness = tables.fineness, affordable(placements, tables.time, tables.fineness)
     for prim, bound in zip(prims, bind(prims, tables.notices), strict=True):
         parts[prim.GetPath()] = _part(prim, bound, shapes, tables)
@@ -354,12 +356,17 @@ def _part(prim: Usd.Prim, bound: Bound, shapes: dict[Sdf.Path, Shape | None], ta
     shared = prim.IsInstanceProxy()
     key = prim.GetPrimInPrototype().GetPath() if shared else prim.GetPath()
     try:
-        shape = shapes[key] if key in shapes else read_shape(prim, tables.time, tables.notices, tables.fineness)
+        if key in shapes:
+            shape = shapes[key]
+        else:
+            cut = tables.cuts.get(prim.GetPath())
+            shape = read_shape(prim, tables.time, tables.notices, tables.fineness, cut)
         if shared:
             shapes[key] = shape
         part = assemble(prim, shape, bound, tables) if shape is not None else None
-        if part is not None and part.shape.subdivided and not shared:  # what it was made of is larger than it is
-            part = part._replace(shape=replace(part.shape, topology=None))
+        topology = part.shape.topology if part is not None else None
+        if part is not None and topology is not None and topology.refinement is not None and not shared:
+            part = part._replace(shape=replace(part.shape, topology=None))  # what it was made of is larger than it is
         return part
     except Tf.ErrorException as error:
         reason = " ".join(words_of(part) for part in error.args)

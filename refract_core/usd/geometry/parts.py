@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from pxr import Usd, UsdGeom, UsdShade
+from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from ...scene import F32, I32, Material, Notice, Texture
 from ..materials.read import display_color_material, read_material
 from .cages import FINENESS, is_subdivided, surface_size
+from .curves import Cut
 from .primvars import as_values, read_primvar, spread
 from .refined import Fineness
 from .shapes import Shape
@@ -31,6 +32,8 @@ class Tables:
     notices: list[Notice]
     fineness: Fineness = FINENESS["low"]
     """Of subdivision surfaces"""
+    cuts: dict[Sdf.Path, Cut] = field(default_factory=dict)
+    """Of curves, by prim"""
     textures: dict[str, Texture] = field(default_factory=dict)
     materials: list[Material] = field(default_factory=list)
     numbers: dict[tuple[str, bool], int] = field(default_factory=dict)

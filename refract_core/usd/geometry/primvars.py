@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from pxr import Usd, UsdGeom, Vt
 
 from ...scene import F32, Notice
-from .refined import Refinement
 from .triangulate import Index, turned_over
 
 CHANNELS = 4
+
+
+class Finer(Protocol):
+    """The way from what a prim authors to what is drawn, where that has more points: `Refinement`, `Along`."""
+
+    def corners(self, values: F32, interpolation: str) -> tuple[F32, Index]:
+        """Values (K, D) of an interpolation that is neither constant nor uniform, brought there, and which of them
+        each corner takes."""
 
 
 class Topology(NamedTuple):
@@ -29,8 +36,10 @@ class Topology(NamedTuple):
     """of the prim, as the next two"""
     point_count: int
     face_count: int
-    refinement: Refinement | None = None
-    """Of a subdivision surface"""
+    refinement: Finer | None = None
+    """Of a subdivision surface, and of curves"""
+    varying_count: int | None = None
+    """Of curves, whose `varying` values are not as many as their points"""
 
     def turned_over(self) -> Topology:
         """The same of triangles whose last two corners have changed places."""
@@ -96,6 +105,8 @@ def to_corners(values: F32, picks: Index | None, interpolation: str, topology: T
 def _places(interpolation: str, topology: Topology) -> tuple[Index, int]:
     if interpolation == UsdGeom.Tokens.uniform:
         return np.broadcast_to(topology.faces[:, None], topology.corners.shape), topology.face_count
+    if interpolation == UsdGeom.Tokens.varying and topology.varying_count is not None:
+        return topology.vertices, topology.varying_count
     if interpolation in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying):
         return topology.vertices, topology.point_count
     if interpolation == UsdGeom.Tokens.faceVarying:

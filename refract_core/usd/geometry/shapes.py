@@ -12,7 +12,7 @@ from pxr import Usd, UsdGeom
 
 from ...scene import F32, F64, U32, Notice
 from ...world.solid import across, looks_inwards
-from . import gprims
+from . import curves, gprims
 from .cages import (
     FINENESS,
     SUBDIVISION_ATTRIBUTES,
@@ -26,6 +26,7 @@ from .cages import (
 )
 from .primvars import Corners, Topology, Unusable, as_values, evaluate, to_corners
 from .refined import Fineness, surface
+from .traverse import CURVES
 from .triangulate import (
     Index,
     Triangles,
@@ -109,15 +110,19 @@ class Shape:
 
 
 def read_shape(
-    prim: Usd.Prim, time: Usd.TimeCode, notices: list[Notice], fineness: Fineness = FINENESS["low"]
-) -> Shape | None:
-    """Triangles of a Mesh or gprim at a time; None, with a notice that says why, where nothing is left to draw.
+    prim: Usd.Prim, time: Usd.TimeCode, notices: list[Notice], fineness: Fineness = FINENESS["low"],
+    cut: curves.Cut | None = None,
+) -> Shape | None:  # fmt: skip
+    """Triangles of a Mesh, gprim or curves at a time; None, with a notice that says why, where nothing is left to draw.
 
     Args:
         fineness: of subdivision surfaces
+        cut: how finely curves are cut; None asks the prim alone, and `fineness`
     """
     try:
-        if prim.GetTypeName() != "Mesh":
+        if prim.GetTypeName() in CURVES:
+            shape = _read_curves(prim, time, notices, fineness, cut)
+        elif prim.GetTypeName() != "Mesh":
             shape = _read_gprim(prim, time)
         elif is_subdivided(prim, time):
             shape = _read_surface(UsdGeom.Mesh(prim), time, notices, fineness)
@@ -147,6 +152,22 @@ def _read_gprim(prim: Usd.Prim, time: Usd.TimeCode) -> Shape:
         double_sided=bool(UsdGeom.Gprim(prim).GetDoubleSidedAttr().Get(time)),
         varying=_varies(prim, gprims.ATTRIBUTES[prim.GetTypeName()]),
         is_sphere=gprim.is_sphere,
+    )
+
+
+def _read_curves(
+    prim: Usd.Prim, time: Usd.TimeCode, notices: list[Notice], fineness: Fineness, cut: curves.Cut | None
+) -> Shape:
+    """Curves as tubes, which are solids, or as ribbons."""
+    drawn = curves.read_curves(prim, time, notices, fineness, cut)
+    return Shape(
+        points=drawn.sides.points,
+        triangles=drawn.sides.triangles,
+        normals=Corners(drawn.sides.normals, drawn.sides.normal_rows),
+        topology=drawn.topology,
+        closed=drawn.round,
+        double_sided=not drawn.round,
+        varying=_varies(prim, curves.ATTRIBUTES),
     )
 
 

@@ -19,7 +19,16 @@ MAX_INSTANCES = 100_000
 MAX_PRIMS = 4_000_000
 """Prims looked at, native instances expanded."""
 
-DRAWN = frozenset({"Mesh", *ATTRIBUTES})
+CURVES = ("BasisCurves", "HermiteCurves")
+DRAWN = frozenset({"Mesh", *ATTRIBUTES, *CURVES})
+_INSTEAD = {
+    "NurbsCurves": "convert it to BasisCurves of basis bspline, or to a Mesh",
+    "TetMesh": "its surface as a Mesh is (UsdGeomTetMesh.ComputeSurfaceFaces)",
+    "Volume": "smoke and fog are left out; a Mesh of a level, or absorption in glass, stands for a simple one",
+    "ParticleField": "splats are left out; a Mesh or Points made from them can be drawn",
+    "ParticleField3DGaussianSplat": "splats are left out; a Mesh or Points made from them can be drawn",
+}
+"""What to do about kinds of prims that are not drawn, where that is not to convert them to a Mesh."""
 # Prototypes of a point instancer are often `over` or `class` prims, so that nothing else draws them.
 _PROTOTYPES = Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)
 _INSTANCER_ATTRIBUTES = ("protoIndices", "positions", "orientations", "orientationsf", "scales", "invisibleIds")
@@ -74,7 +83,8 @@ def walk(stage: Usd.Stage, time: Usd.TimeCode, purposes: tuple[str, ...], notice
     start = _Node(stage.GetPseudoRoot(), Gf.Matrix4d(1.0), UsdGeom.Imageable.PurposeInfo(), True)
     found = list(_descend(state, start, Usd.TraverseInstanceProxies(), 0))
     for kind, paths in sorted(state.unsupported.items()):
-        notices.append(Notice(paths[0], f"{kind} is not rendered; convert it to a Mesh ({some_of(paths)})"))
+        what = _INSTEAD.get(kind, "convert it to a Mesh")
+        notices.append(Notice(paths[0], f"{kind} is not rendered; {what} ({some_of(paths)})"))
     if state.drawn_otherwise:
         text = f"model:drawMode is ignored, the geometry itself is drawn ({some_of(state.drawn_otherwise)})"
         notices.append(Notice(state.drawn_otherwise[0], text))

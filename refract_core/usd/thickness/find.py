@@ -20,7 +20,7 @@ from ..geometry.place import uniform_scale
 from ..geometry.primvars import Corners, Topology, read_primvar, spread
 from ..geometry.shapes import Shape, read_shape
 from ..geometry.skel import posed
-from ..geometry.traverse import Placement, walk
+from ..geometry.traverse import CURVES, Placement, walk
 from ..geometry.triangulate import turned_over, weld
 from ..materials.read import THICKNESS_PRIMVAR, has_api, read_material
 from ..ours import recognised
@@ -222,6 +222,8 @@ def _binding(site: Usd.Prim) -> str:
 
 def read_body(candidate: Candidate, time: Usd.TimeCode, *, wants_uv: bool) -> Body | str:
     """The geometry of a candidate; a sentence that says why it cannot be measured where that is so."""
+    if candidate.prim.GetTypeName() in CURVES:
+        return "it is curves, whose thickness is their widths"
     notices: list[Notice] = []
     shape = read_shape(candidate.prim, time, notices)
     if shape is None:

@@ -15,6 +15,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from ...scene import F64, Notice
 from ..geometry.primvars import Topology
+from ..geometry.refined import Refinement
 from ..geometry.triangulate import Index
 from ..layers.write import apply_api
 from ..materials.read import THICKNESS_PRIMVAR
@@ -68,7 +69,7 @@ def spread_values(body: Body, values: F64) -> tuple[str, F64]:
     assert body.topology is not None
     at = values[:, [0, 2, 1]] if body.mirrored else values
     points, corners = body.topology.vertices, body.topology.corners
-    if body.topology.refinement is not None:
+    if isinstance(body.topology.refinement, Refinement):
         return _spread_to_cage(body.topology, body.topology.refinement.cage_corners[corners], at)
     of_point = np.full(body.topology.point_count, at.mean())  # what no triangle uses is not drawn
     of_point[points.ravel()] = at.ravel()
