@@ -297,6 +297,10 @@ class Camera:
     """near, far along the camera axis [m]"""
     exposure_scale: float = 1.0
     """Linear factor on every colour (UsdGeomCamera.ComputeLinearExposureScale)."""
+    lens_radius: float = 0.0
+    """[m]; 0 is a pinhole, which has everything in focus. For perspective."""
+    focus_distance: float = 1.0
+    """[m] along the camera axis: what is there is sharp however wide the lens is."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from refract_core.kernels.compile import kernel
 from refract_core.kernels.lanes import by_address
 from refract_core.kernels.sampling import pixel_offsets
 from refract_core.scene import Camera
-from refract_core.view.camera import View, image_size, pixel_point, pixel_ray, project, view_of
+from refract_core.view.camera import View, image_size, lens_points, pixel_point, pixel_ray, project, view_of
 
 F64 = NDArray[np.float64]
 
@@ -122,3 +122,62 @@ def test_jitter_moves_rays_by_that_many_pixels(of: Camera) -> None:
 def test_an_empty_window_is_refused(window: tuple[float, float, float, float]) -> None:
     with pytest.raises(UsageError, match="/camera"):
         view_of(replace(PERSPECTIVE, window=window), 4, 4)
+
+
+# --- lenses ---------------------------------------------------------------------------------------------------------
+
+
+def test_points_of_a_lens_are_evenly_spread() -> None:
+    """Moments of an even disc: mean 0, mean square half of the radius'; no two points are the same, nor leave it."""
+    assert lens_points(1) == [(0.0, 0.0)]
+    for samples in (2, 4, 16, 61, 128, 256):
+        points = np.array(lens_points(samples))
+        assert len(np.unique(points.round(9), axis=0)) == samples
+        assert (np.linalg.norm(points, axis=1) <= 1.0).all()
+        assert (points**2).sum(axis=1).mean() == pytest.approx(0.5)
+        assert np.linalg.norm(points.mean(axis=0)) < 1.0 / samples**0.75
+        assert abs(np.corrcoef(points[:, 0], np.array(pixel_offsets(samples))[:, 0])[0, 1]) < 0.6 or samples < 16
+
+
+LENS = replace(PERSPECTIVE, lens_radius=0.05, focus_distance=4.0)
+
+
+def test_what_is_in_focus_stays_and_the_rest_moves_by_the_thin_lens() -> None:
+    """By a thin lens of focal length F at the image distance v = f F / (f - F), a point at a depth d makes a disc
+    A F |d - f| / (d (f - F)) wide on the film, for an aperture A and a focus f; over v, which fills the window, it is
+    A |d - f| / (d f)."""
+    rng = np.random.default_rng(2)
+    width, height = 120, 72
+    for lens in [(0.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.6, 0.8)]:
+        view = view_of(LENS, width, height, lens=lens)
+        for depth in (0.5, 2.0, 4.0, 9.0):
+            pixels = np.stack([rng.uniform(0, width, 20), rng.uniform(0, height, 20), np.full(20, depth)], axis=1)
+            there = np.empty_like(pixels)
+            _points_of(by_address(view_of(LENS, width, height)), pixels, there)
+            seen = np.empty_like(pixels)
+            _seen(by_address(view), there, seen)
+            moved = seen[:, :2] - pixels[:, :2]
+            window = view.window[1] - view.window[0]
+            disc = 2 * LENS.lens_radius * abs(depth - 4.0) / (depth * 4.0) * width / window
+            by = np.array([lens[0], -lens[1]]) * disc / 2 * np.sign(depth - 4.0)
+            np.testing.assert_allclose(moved, np.broadcast_to(by, moved.shape), atol=1e-9)
+            np.testing.assert_allclose(seen[:, 2], depth)
+
+
+@kernel
+def _points_of(view: View, pixels: F64, out: F64) -> None:
+    for i in range(pixels.shape[0]):
+        p = pixel_point(view, pixels[i, 0], pixels[i, 1], pixels[i, 2])
+        out[i, 0], out[i, 1], out[i, 2] = p[0], p[1], p[2]
+
+
+@kernel
+def _seen(view: View, points: F64, out: F64) -> None:
+    for i in range(points.shape[0]):
+        out[i, 0], out[i, 1], out[i, 2] = project(view, (points[i, 0], points[i, 1], points[i, 2]))
+
+
+def test_a_lens_without_a_radius_changes_no_bit() -> None:
+    for lens in [(0.0, 0.0), (0.3, -0.9)]:
+        mine, own = view_of(PERSPECTIVE, 33, 21, (0.1, 0.2), 4, lens), view_of(PERSPECTIVE, 33, 21, (0.1, 0.2), 4)
+        assert all(np.array_equal(np.asarray(one), np.asarray(other)) for one, other in zip(mine, own, strict=True))

@@ -43,5 +43,12 @@ def test_the_group_is_padded_to_its_width(pattern: str, time_code: float, path: 
     assert frame_path(pattern, time_code) == path
 
 
+def test_a_single_frame_needs_no_group() -> None:
+    assert frame_jobs("7", "a.png") == [(7.0, "a.png")]
+    assert frame_jobs("7", "a.##.png") == [(7.0, "a.07.png")]
+    with pytest.raises(UsageError, match="exactly one ### group"):
+        frame_jobs("7,8", "a.png")
+
+
 def test_without_frames_there_is_one_job_at_the_stages_start() -> None:
     assert frame_jobs("", "some#folder/a.png") == [(None, "some#folder/a.png")]

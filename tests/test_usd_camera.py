@@ -13,7 +13,7 @@ from scene_reading import CUBE, F64, read, stage_of, texts, to_stage
 
 from refract_core.errors import UsageError
 from refract_core.scene import Camera, Scene
-from refract_core.usd.camera import frame_everything
+from refract_core.usd.camera import frame_everything, see_everything
 from refract_core.usd.stage import scene_from_stage
 
 
@@ -148,11 +148,53 @@ def test_impossible_values_are_named_and_replaced(extra: str, name: str) -> None
     assert 0 < camera.exposure_scale < math.inf
 
 
-def test_depth_of_field_is_named_as_ignored_for_the_camera_in_use() -> None:
-    scene = read(camera_text(extra="float fStop = 2.8") + camera_text("Other", "float fStop = 4"))
-    assert "depth of field is ignored" in texts(scene, "/Cam")
-    assert not texts(scene, "/Other")
-    assert "depth of field" not in texts(read(camera_text(extra="float fStop = 0")), "/Cam")
+@pytest.mark.parametrize("unit", [0.01, 1.0])
+def test_a_lens_is_as_wide_as_its_focal_length_over_its_stop(unit: float) -> None:
+    """50 mm at f / 2.5 are a lens of 20 mm across, where a scene unit is a centimetre."""
+    lens = "float focalLength = 50\nfloat fStop = 2.5\nfloat focusDistance = 300"
+    (camera,) = read(camera_text(extra=lens), unit=unit).cameras
+    assert camera.lens_radius == pytest.approx(1.0 * unit)
+    assert camera.focus_distance == pytest.approx(300 * unit)
+
+
+@pytest.mark.parametrize(
+    ("extra", "said"),
+    [
+        ("float fStop = 0\nfloat focusDistance = 3", ""),
+        ("float focusDistance = 3", ""),
+        ("float fStop = 2.8", "focusDistance is 0"),
+        ("float fStop = 2.8\nfloat focusDistance = -4", "focusDistance is -4"),
+        ("float fStop = nan\nfloat focusDistance = 4", "fStop is nan"),
+        ("float fStop = 2.8\nfloat focusDistance = 4\ntoken projection = 'orthographic'", "it is orthographic"),
+    ],
+)
+def test_a_lens_without_a_stop_or_a_focus_is_a_pinhole(extra: str, said: str) -> None:
+    scene = read(camera_text(extra=extra))
+    assert scene.cameras[0].lens_radius == 0.0
+    assert said in texts(scene, "/Cam")
+    assert bool(texts(scene, "/Cam")) == bool(said)
+
+
+def test_render_settings_switch_the_lens_off() -> None:
+    lens = camera_text(extra="float fStop = 2\nfloat focusDistance = 3")
+    for off in (0, 1):
+        scene = read(lens + f'def RenderSettings "R" {{ bool disableDepthOfField = {off} }}', head=HEAD)
+        assert (scene.cameras[0].lens_radius == 0.0) == bool(off)
+
+
+SHUTTER = "double shutter:open = -0.25\ndouble shutter:close = 0.25"
+MOVES = "double3 xformOp:translate.timeSamples = { 0: (0, 0, 0), 1: (1, 0, 0) }\n"
+MOVES += 'uniform token[] xformOpOrder = ["xformOp:translate"]'
+
+
+def test_a_shutter_that_stays_open_is_named_where_something_moves() -> None:
+    still, moving = CUBE(), CUBE(extra=MOVES)
+    assert "motion blur is not drawn" in texts(read(moving + camera_text(extra=SHUTTER)), "/Cam")
+    assert "motion blur is not drawn" in texts(read(still + camera_text(extra=SHUTTER + "\n" + MOVES)), "/Cam")
+    assert not texts(read(still + camera_text(extra=SHUTTER)), "/Cam")
+    assert not texts(read(moving + camera_text()), "/Cam")
+    closed = SHUTTER.replace("-0.25", "0.25")
+    assert not texts(read(moving + camera_text(extra=closed)), "/Cam")
 
 
 def test_a_camera_without_a_place_is_skipped() -> None:
@@ -214,7 +256,89 @@ def test_without_a_camera_everything_is_in_the_picture(up: str) -> None:
         assert (np.abs(seen[:, 1] / depth) <= camera.window[3]).all()
 
 
-def test_it_stands_where_usdrecord_puts_its_own() -> None:
+def seen_by(camera: Camera, points: F64) -> F64:
+    """Place in the picture, -1 .. 1 from edge to edge, shape (N, 2)."""
+    at = (points - camera.world_from_camera[:3, 3]) @ camera.world_from_camera[:3, :3]
+    found: F64 = at[:, :2] / -at[:, 2:] / (camera.window[1], camera.window[3])
+    return found
+
+
+sides = st.sampled_from([0.0, 0.1, 1.0, 7.0])
+
+
+@given(st.tuples(sides, sides, sides))
+def test_without_a_camera_nothing_flat_is_seen_edge_on(size: tuple[float, float, float]) -> None:
+    """Everything fits with air around it, and a flat thing covers a part of the picture, however it lies."""
+    high = np.array(size) / 2
+    camera, _ = see_everything(((-high[0], -high[1], -high[2]), (high[0], high[1], high[2])))
+    corners = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * high
+    seen = seen_by(camera, corners)
+    assert np.abs(seen).max() <= 1.0 + 1e-9
+    if sum(side > 0.5 for side in size) >= 2 and min(size) == 0.0:
+        flat = np.unique(corners, axis=0)
+        a, b, c = (seen_by(camera, flat[k : k + 1])[0] for k in (0, 1, 2))
+        area = abs((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
+        assert area > 0.03 * 4.0
+
+
+def test_a_picture_on_a_plane_is_looked_at_from_the_front() -> None:
+    scene = read(PICTURE)
+    assert scene.cameras[0].world_from_camera[:3, :3] == pytest.approx(np.eye(3))
+    assert any("from the front is used" in notice.text for notice in scene.notices)
+
+
+PICTURE = """def Mesh "Picture" {
+    int[] faceVertexCounts = [4]
+    int[] faceVertexIndices = [0, 1, 2, 3]
+    point3f[] points = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]
+    uniform token subdivisionScheme = "none" }
+"""
+
+SAVED = """customLayerData = {
+    dictionary cameraSettings = {
+        dictionary Perspective = {
+            double3 position = (3, 4, 5)
+            double3 target = (1, 1, 1)
+        }
+        string boundCamera = "/OmniverseKit_Persp"
+    }
+}"""
+
+
+@pytest.mark.parametrize("up", ["Y", "Z"])
+def test_without_a_camera_the_view_that_a_stage_was_saved_with_is_taken(up: str) -> None:
+    scene = read(CUBE(), up=up, head=SAVED)
+    (camera,) = scene.cameras
+    start, along = ray(scene, camera, 0.0, 0.0)
+    assert start == pytest.approx((3, 4, 5), abs=1e-5)
+    assert along == pytest.approx(-np.array([2, 3, 4]) / math.sqrt(29), abs=1e-6)
+    _, upward = ray(scene, camera, 0.0, 1.0)
+    vertical = np.array({"Y": (0, 1, 0), "Z": (0, 0, 1)}[up])
+    assert np.cross(along, upward) @ vertical == pytest.approx(0.0, abs=1e-6)  # upright
+    assert upward @ vertical > along @ vertical
+    half = math.degrees(math.atan(camera.window[1]))
+    assert 2 * half == pytest.approx(60.0, abs=0.01)  # Kit's own camera
+    assert any("the view it was saved with" in notice.text for notice in scene.notices)
+
+
+@pytest.mark.parametrize(
+    "broken", [("(3, 4, 5)", "(1, 1, 1)"), ("(3, 4, 5)", "(nan, 4, 5)"), ("double3 position", "string other")]
+)
+def test_a_saved_view_that_makes_no_sense_is_passed_over(broken: tuple[str, str]) -> None:
+    head = SAVED.replace(*broken)
+    head = head.replace("string other = (3, 4, 5)", 'string other = "x"')
+    scene = read(CUBE(), head=head)
+    assert any("cameraSettings" in notice.text for notice in scene.notices)
+    assert any("frames everything" in notice.text for notice in scene.notices)
+
+
+def test_the_camera_that_a_stage_was_saved_with_comes_before_the_first() -> None:
+    scene = read(SEVERAL, head=SAVED.replace("/OmniverseKit_Persp", "/b"))
+    assert scene.cameras[0].path == "/b"
+    assert read(SEVERAL, head=SAVED).cameras[0].path == "/X/deep"
+
+
+def test_what_is_flat_in_depth_is_seen_from_where_usdrecord_sees_it() -> None:
     """The field of view spans the diagonal of the front face (UsdAppUtilsFrameRecorder): for a 4 x 3 x 2 box and 50 mm
     over 20.955 mm that is 2.5 / tan(half) + 1 in front of the centre."""
     camera = frame_everything(((-2, -1.5, -1), (2, 1.5, 1)))

@@ -21,8 +21,8 @@ Out = Annotated[
     str,
     typer.Argument(
         metavar="OUT",
-        help="The picture to write: .exr holds all AOVs, .png, .jpg, .webp and .tif hold one. With --frames the file "
-        "name has one ### group, such as shot.###.png, or shot.###.##.png for fractions of a frame.",
+        help="The picture to write: .exr holds all AOVs, .png, .jpg, .webp and .tif hold one. With several --frames "
+        "the file name has one ### group, such as shot.###.png, or shot.###.##.png for fractions of a frame.",
     ),
 ]
 Camera = Annotated[
@@ -155,7 +155,8 @@ Complexity = Annotated[
     typer.Option(
         metavar="low|medium|high|veryhigh",
         help="How fine subdivision surfaces are: a face of a cage becomes 4 x 4 quads with low, 8 x 8, 16 x 16, and "
-        "32 x 32 with veryhigh, all on the limit surface; more where a cage has few faces, fewer where many.",
+        "32 x 32 with veryhigh, all on the limit surface; more where a cage has few faces, fewer where many. And "
+        "curves: a tube has 24, 32, 48 or 64 sides, and its pieces half as many segments, fewer where curves are many.",
     ),
 ]
 ColorCorrection = Annotated[
@@ -198,6 +199,12 @@ Executor = Annotated[
     ),
 ]
 SkipExisting = Annotated[bool, typer.Option("--skip-existing", help="Leave pictures that exist as they are.")]
+Strict = Annotated[
+    bool,
+    typer.Option(
+        "--strict", help="Fail where a picture shows nothing of the stage. It is written, and the rest is rendered."
+    ),
+]
 
 
 @app.command()
@@ -233,6 +240,7 @@ def render(
     executor: Executor = "",
     tile_size: TileSize = None,
     skip_existing: SkipExisting = False,
+    strict: Strict = False,
     progress: ProgressMode = "auto",
 ) -> None:
     """Render a stage to a picture, or to one picture per frame."""
@@ -271,6 +279,7 @@ def render(
             color_correction=color_correction_mode,
             complexity=complexity,
             skip_existing=skip_existing,
+            strict=strict,
         )
         render_files(order, report, cancel, crew)
 

@@ -18,7 +18,7 @@ from ..transport.eye import view_ray
 from ..transport.pixels import tree_tile
 from ..transport.tiers import Asking
 from ..transport.tree import TreeScratch
-from ..view.camera import Tile, View, corners_of, view_of
+from ..view.camera import Tile, View, corners_of, lens_points, view_of
 from ..view.gbuffer import OpaqueLayer, ViewScratch, new_hits, opaque_tile
 from ..view.planes import Planes
 from ..view.pyramid import Screen, blur_level, fill_depth_levels, new_blur_scratch, new_screen_buffers
@@ -38,6 +38,13 @@ nodes with fewer rays, and more noise."""
 def needs_compiling(settings: RenderSettings) -> bool:
     """The largest kernel that these settings ask for is not there yet."""
     return not is_compiled(corner_tile if settings.by_corners else tree_tile)
+
+
+def sample_views(camera: Camera, size: tuple[int, int], samples: int) -> Iterator[View]:
+    """The views of samples that are pictures of their own, each through its place of a pixel and its point of a lens:
+    a screen that glass may ask shows what is seen from one point."""
+    for offset, lens in zip(pixel_offsets(samples), lens_points(samples), strict=True):
+        yield view_of(camera, *size, offset, samples, lens)
 
 
 class Tree:
@@ -80,8 +87,8 @@ class Tree:
             yield from self._corner_passes()
             return
         samples = self.settings.samples
-        for sample, offset in enumerate(pixel_offsets(samples)):
-            yield from self._sample_passes(view_of(self.camera, *self.size, offset, samples), sample, 1.0 / samples)
+        for sample, view in enumerate(sample_views(self.camera, self.size, samples)):
+            yield from self._sample_passes(view, sample, 1.0 / samples)
 
     def _corner_passes(self) -> Iterator[Pass]:
         settings, (width, height) = self.settings, self.size

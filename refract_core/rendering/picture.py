@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from ..images.frame import Frame
 from ..kernels.lanes import by_address
-from ..kernels.sampling import pixel_offsets
 from ..models import BY_TOKEN, SHEET, Behind
 from ..probes.capture import Over, face_camera, paste_face
 from ..probes.lookup import empty_table
@@ -28,7 +27,7 @@ from ..view.camera import image_size, view_of
 from ..view.planes import by_name, finish_of, finish_tile, new_planes
 from ..world.embree import Bvh
 from ..world.tables import World
-from .branching import Tree, needs_compiling
+from .branching import Tree, needs_compiling, sample_views
 from .ready import PROBE_SAMPLES, Ready, choose_camera, prepare, prepare_bare
 from .session import Session
 from .work import Cancel, Progress, Work, tiles_of, working
@@ -68,7 +67,7 @@ def render(
     camera = choose_camera(scene, settings.camera)
     width, height = image_size(camera, settings.image_width, settings.image_height)
     with working(executor, settings.jobs, progress, cancel) as work:
-        if needs_compiling(settings):
+        if needs_compiling(_as_drawn(settings, camera)):
             work.progress(0.0, COMPILING)
         ready = prepare(scene, camera, settings, work, glass_over(scene, camera, settings, work), session)
         planes, rays = _draw(ready, scene, camera, settings, (width, height), work)
@@ -85,7 +84,7 @@ def render(
         "refract:rays": float(rays + ready.rays),
     }
     notices = scene.notices + camera_light(scene) + open_meshes(scene, settings.model) + glass_twice(scene, settings)
-    notices += ready.notices
+    notices += ready.notices + lens_of_few(camera, settings) + nothing_seen(scene, camera, planes)
     return Frame(width, height, planes, metadata, notices)
 
 
@@ -93,6 +92,33 @@ def camera_light(scene: Scene) -> tuple[Notice, ...]:
     """Say that a light was added that the stage does not have."""
     text = "no light, no dome and nothing that glows, so the camera lights it; --disable-camera-light leaves that out"
     return (Notice("/", text),) if scene.camera_light else ()
+
+
+NOTHING_SEEN = "no pixel of the picture shows anything of the stage"
+"""How the notice about a picture of nothing begins."""
+
+
+def nothing_seen(scene: Scene, camera: Camera, planes: dict[str, NDArray[np.float32]]) -> tuple[Notice, ...]:
+    """Say that the camera looks past everything: no pixel has a depth, glass, or, where no sky covers all, an alpha."""
+    covered = scene.environment is None and (planes["beauty"][..., 3] > 0.0).any()
+    if covered or (planes["Z"] < np.inf).any() or (planes["mask"] > 0.0).any():
+        return ()
+    text = "; look at the camera's place, its clippingRange, what is visible, and the purposes"
+    return (Notice(camera.path or "/", NOTHING_SEEN + text),)
+
+
+_LENS_SAMPLES = 64
+
+
+def lens_of_few(camera: Camera, settings: RenderSettings) -> tuple[Notice, ...]:
+    """Say that a lens was seen through from few points."""
+    if not camera.lens_radius or settings.samples >= _LENS_SAMPLES:
+        return ()
+    if settings.samples == 1:
+        text = "its lens is left out, because there is one sample: everything is in focus"
+    else:
+        text = f"what is out of focus is drawn from {settings.samples} points of the lens, and may show as many edges"
+    return (Notice(camera.path, f"{text}; --samples {2 * _LENS_SAMPLES} or more is smooth"),)
 
 
 def open_meshes(scene: Scene, model: str) -> tuple[Notice, ...]:
@@ -120,6 +146,7 @@ def _draw(
     ready: Ready, scene: Scene, camera: Camera, settings: RenderSettings, size: tuple[int, int], work: Work
 ) -> tuple[dict[str, NDArray[np.float32]], int]:
     """All samples, averaged into planes. Returns the planes by AOV name, and rays traced."""
+    settings = _as_drawn(settings, camera)
     tiles = tiles_of(*size, settings.tile_size)
     planes = new_planes(*size)
     rays, done = 0, 0.2
@@ -128,7 +155,9 @@ def _draw(
         rays += sum(work.run(step.draw, step.items, _told(work, done, share)))
         done += share
     finish = by_address(finish_of(scene, settings.samples, camera.exposure_scale * 2.0**settings.exposure))
-    first, target = by_address(view_of(camera, *size, _first_offset(settings))), by_address(planes)
+    # Data of the picture are of one place in each pixel: its middle, or the first sample's.
+    place = view_of(camera, *size) if settings.by_corners else next(sample_views(camera, size, settings.samples))
+    first, target = by_address(place), by_address(planes)
     work.run(lambda tile: finish_tile(target, first, finish, tile), tiles)
     return by_name(planes), rays
 
@@ -137,9 +166,9 @@ def _told(work: Work, done: float, share: float) -> Callable[[float], None]:
     return lambda part: work.progress(done + share * part, "image")
 
 
-def _first_offset(settings: RenderSettings) -> tuple[float, float]:
-    """Where in their pixels the places stand that the picture's data are of."""
-    return (0.0, 0.0) if settings.by_corners else pixel_offsets(settings.samples)[0]
+def _as_drawn(settings: RenderSettings, camera: Camera) -> RenderSettings:
+    """A lens sees around things, so every sample is a picture of its own: corners of pixels would all be alike."""
+    return replace(settings, tolerance=0.0) if camera.lens_radius > 0.0 else settings
 
 
 # --- what probes see of glass ---------------------------------------------------------------------------------------

@@ -3,17 +3,30 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from pxr import Gf, Usd, UsdGeom, UsdRender
 
 from ..errors import UsageError
 from ..scene import F64, Camera, Notice
+from .values import numbers
 
+Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
+"""Lowest and highest corner [m], engine world."""
 FOCAL_LENGTH = 50.0
 APERTURE = (20.955, 15.2908)
 """Horizontal and vertical [tenths of a scene unit]; fallbacks of UsdGeomCamera."""
 MAIN_CAMERA = "main_cam"
+_TENTH = 0.1
+"""Scene units of what a UsdGeomCamera's lens and film are measured in."""
+_SAVED_FOCAL_LENGTH = 18.147562
+"""Of the view that Omniverse's applications open a stage with, over the same aperture."""
+_FLAT = 0.02
+"""Of its largest side: under it bounds are flat along an axis, and seen from there are a line."""
+_AIR = 1.1
+"""How much farther than need be the camera stands that is made for a stage without one."""
 
 
 def read_cameras(
@@ -64,7 +77,7 @@ def _read(
         for attribute in (camera.GetHorizontalApertureOffsetAttr(), camera.GetVerticalApertureOffsetAttr())
     ]
     # An orthographic aperture is a length in the scene: tenths of a unit.
-    unit = 0.1 * metres_per_unit if orthographic else 1.0 / focal
+    unit = _TENTH * metres_per_unit if orthographic else 1.0 / focal
     return Camera(
         path=path,
         world_from_camera=pose,
@@ -77,7 +90,31 @@ def _read(
         orthographic=orthographic,
         clipping=_clipping(camera, time, orthographic, metres_per_unit, notices),
         exposure_scale=_exposure(camera, time, notices),
+        **_lens(camera, time, orthographic, focal, metres_per_unit, notices),
     )
+
+
+def _lens(
+    camera: UsdGeom.Camera, time: Usd.TimeCode, orthographic: bool, focal: float, metres_per_unit: float,
+    notices: list[Notice],
+) -> dict[str, float]:  # fmt: skip
+    """Radius and focus of the lens, for a `Camera`; nothing where everything is in focus.
+
+    Source: UsdGeomCamera, where fStop 0 turns it off, and apertures are focalLength / fStop wide.
+    """
+    stops = _finite(camera.GetFStopAttr(), time, 0.0, notices)
+    settings = UsdRender.Settings.GetStageRenderSettings(camera.GetPrim().GetStage())
+    off = settings and settings.GetDisableDepthOfFieldAttr().Get(Usd.TimeCode.EarliestTime())
+    if stops <= 0.0 or off:
+        return {}
+    focus = _finite(camera.GetFocusDistanceAttr(), time, 0.0, notices)
+    if focus > 0.0 and not orthographic:
+        radius = focal * _TENTH / (2.0 * stops)
+        return {"lens_radius": radius * metres_per_unit, "focus_distance": focus * metres_per_unit}
+    why = "it is orthographic" if orthographic else f"its focusDistance is {focus:g}"
+    text = f"fStop is {stops:g}, but {why}; everything is in focus"
+    notices.append(Notice(str(camera.GetPath()), text))
+    return {}
 
 
 def _rigid(matrix: Gf.Matrix4d, engine_from_stage: F64) -> F64 | None:
@@ -138,24 +175,95 @@ def choose_camera(
     time: Usd.TimeCode,
     cameras: tuple[Camera, ...],
     wanted: str,
-    bounds: tuple[tuple[float, float, float], tuple[float, float, float]],
+    bounds: Bounds,
+    *,
+    moving: bool,
+    engine_from_stage: F64,
+    metres_per_unit: float,
     notices: list[Notice],
 ) -> tuple[Camera, ...]:
     """The cameras with the one to use in front, and notices about what of it is ignored.
 
     The order of choice: `wanted` (a prim path or name), the camera of the stage's render settings, a camera named
-    main_cam, the first by path, and one made to frame everything.
+    main_cam, the one that the stage was saved with, the first by path; where it has none, the view that it was saved
+    with, and one made to frame everything.
+
+    Args:
+        moving: something that is drawn varies in time
 
     Raises:
         UsageError: where `wanted` is no camera of the stage.
     """
     chosen = _choose(stage, cameras, wanted, notices)
     if chosen is None:
-        notices.append(Notice("/", "the stage has no camera; one that frames everything from the front is used"))
-        return (frame_everything(bounds),)
-    if (UsdGeom.Camera(stage.GetPrimAtPath(chosen.path)).GetFStopAttr().Get(time) or 0.0) > 0.0:
-        notices.append(Notice(chosen.path, "fStop is above 0, but depth of field is ignored; everything is in focus"))
+        saved = _saved_view(stage, bounds, engine_from_stage, metres_per_unit, notices)
+        if saved is not None:
+            text = "the stage has no camera; the view it was saved with is used (customLayerData, cameraSettings)"
+            notices.append(Notice("/", text))
+            return (saved,)
+        camera, where = see_everything(bounds)
+        notices.append(Notice("/", f"the stage has no camera; one that frames everything from {where} is used"))
+        return (camera,)
+    notices.extend(_frozen(UsdGeom.Camera(stage.GetPrimAtPath(chosen.path)), time, moving))
     return (chosen, *(camera for camera in cameras if camera is not chosen))
+
+
+def _frozen(camera: UsdGeom.Camera, time: Usd.TimeCode, moving: bool) -> Iterator[Notice]:
+    """Says that a shutter stays open while things move, which is not drawn."""
+    opens, closes = (attribute.Get(time) for attribute in (camera.GetShutterOpenAttr(), camera.GetShutterCloseAttr()))
+    if opens == closes or not (moving or _moves(camera.GetPrim())):
+        return
+    text = f"its shutter is open from {opens:g} to {closes:g} while things move, but motion blur is not drawn: "
+    yield Notice(str(camera.GetPath()), text + "everything stands still at the time of the frame")
+
+
+def _moves(prim: Usd.Prim) -> bool:
+    while prim:
+        xformable = UsdGeom.Xformable(prim)
+        if xformable and xformable.TransformMightBeTimeVarying():
+            return True
+        prim = prim.GetParent()
+    return False
+
+
+def _saved_with(stage: Usd.Stage) -> dict[str, Any]:
+    """What Omniverse's applications write about their viewport into a stage that they save."""
+    found = stage.GetRootLayer().customLayerData.get("cameraSettings")
+    return found if isinstance(found, dict) else {}
+
+
+def _saved_view(
+    stage: Usd.Stage, bounds: Bounds, engine_from_stage: F64, metres_per_unit: float, notices: list[Notice]
+) -> Camera | None:
+    """The perspective view of a viewport that a stage was saved from; None where it says nothing of use."""
+    view = _saved_with(stage).get("Perspective")
+    if not isinstance(view, dict):
+        return None
+    eye, target = numbers(view.get("position")), numbers(view.get("target"))
+    ends = np.array([eye, target], np.float64) if eye and target and len(eye) == len(target) == 3 else None
+    if ends is None or not np.isfinite(ends).all() or eye == target:
+        text = "cameraSettings in its customLayerData name no position and target of a view; they are passed over"
+        notices.append(Notice(stage.GetRootLayer().identifier, text))
+        return None
+    here, there = ends @ engine_from_stage[:3, :3].T + engine_from_stage[:3, 3]
+    distance = float(np.linalg.norm(there - here))
+    right, top = (side / 2 / _SAVED_FOCAL_LENGTH for side in APERTURE)
+    reach = max(1.0e3 * distance, float(np.linalg.norm(np.abs(bounds).max(axis=0) + np.abs(here))))
+    clipping = distance * 1.0e-3, 2.0 * reach
+    return Camera("", _looking(here, there - here), (-right, right, -top, top), clipping=clipping)
+
+
+def _looking(eye: F64, along: F64) -> F64:
+    """A pose (4, 4) that looks from a point along a direction, upright where it can be."""
+    back = -along / np.linalg.norm(along)
+    across = np.cross((0.0, 1.0, 0.0), back)
+    if np.linalg.norm(across) < 1.0e-6:  # straight down or up
+        across = np.array([1.0, 0.0, 0.0])
+    across /= np.linalg.norm(across)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack((across, np.cross(back, across), back), axis=1)
+    pose[:3, 3] = eye
+    return pose
 
 
 def _choose(stage: Usd.Stage, cameras: tuple[Camera, ...], wanted: str, notices: list[Notice]) -> Camera | None:
@@ -171,6 +279,10 @@ def _choose(stage: Usd.Stage, cameras: tuple[Camera, ...], wanted: str, notices:
         notices.append(Notice(str(settings.GetPath()), text))
     for camera in cameras:
         if _name(camera) == MAIN_CAMERA:
+            return camera
+    bound = str(_saved_with(stage).get("boundCamera", ""))
+    for camera in cameras:
+        if camera.path == bound:
             return camera
     if len(cameras) > 1:
         others = ", ".join(_paths(cameras[1:]))
@@ -198,7 +310,29 @@ def _asked_for(cameras: tuple[Camera, ...], wanted: str, notices: list[Notice]) 
     return matches[0]
 
 
-def frame_everything(bounds: tuple[tuple[float, float, float], tuple[float, float, float]]) -> Camera:
+def see_everything(bounds: Bounds) -> tuple[Camera, str]:
+    """A camera that frames everything, and from where, in words: what is flat like a picture from the front, all else
+    from the front, the right and above, so that nothing along an axis is seen edge-on; what lies flat more from above,
+    what stands flat along the depth more from the right."""
+    low, high = np.array(bounds, np.float64)
+    width, height, depth = high - low
+    least = _FLAT * float(max(width, height, depth))
+    if depth <= least:
+        return frame_everything(bounds), "the front"
+    turn = math.radians(60.0 if width <= least else 30.0)
+    rise = math.radians(45.0 if height <= least else 20.0)
+    back = np.array([math.sin(turn) * math.cos(rise), math.sin(rise), math.cos(turn) * math.cos(rise)])
+    pose = _looking(np.zeros(3), -back)
+    right, top = (side / 2 / FOCAL_LENGTH for side in APERTURE)
+    corners = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * (high - low) / 2 @ pose[:3, :3]
+    needed = np.maximum(np.abs(corners[:, 0]) / right, np.abs(corners[:, 1]) / top) + corners[:, 2]
+    distance = _AIR * float(needed.max())
+    pose[:3, 3] = (low + high) / 2 + distance * back
+    window = (-right, right, -top, top)
+    return Camera("", pose, window, clipping=(distance * 1.0e-3, distance * 1.0e3)), "the front, the right and above"
+
+
+def frame_everything(bounds: Bounds) -> Camera:
     """A 50 mm camera in front of the bounds, looking along -Z, as far away as usdrecord puts its own: the diagonal of
     the bounds' front face spans the picture's width. Bounds so tall that this would cut them are seen from farther.
 

@@ -241,7 +241,9 @@ def _read(
         "metres_per_unit": metres_per_unit,
         "notices": notices,
     }
-    cameras = choose_camera(stage, time, read_cameras(stage, time, **frame), camera, bounds, notices)
+    moving = not (all(mesh.static for mesh in meshes) and all(ball.static for ball in spheres))
+    every_camera = read_cameras(stage, time, **frame)
+    cameras = choose_camera(stage, time, every_camera, camera, bounds, moving=moving, **frame)
     things = [mesh.path for mesh in meshes] + [ball.path for ball in spheres]
     paths = tuple(dict.fromkeys(prim_of(path) for path in things))
     lights, environment = read_lights(stage, time, purposes=purposes, drawn=paths, **frame)

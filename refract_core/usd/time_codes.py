@@ -30,8 +30,8 @@ def frame_jobs(frames: str, pattern: str) -> list[FrameJob]:
 
     Args:
         frames: `101`, `101:110`, `101:110x2`, several of them with commas between; '' is the stage's start alone.
-        pattern: output path. With frames its file name has one group of `#`, such as `shot.###.png`, or
-            `shot.###.##.png` for fractions of a frame.
+        pattern: output path. With several frames its file name has one group of `#`, such as `shot.###.png`, or
+            `shot.###.##.png` for fractions of a frame; a single one needs none.
 
     Raises:
         UsageError: a malformed frame range, or a pattern that does not fit it.
@@ -41,12 +41,15 @@ def frame_jobs(frames: str, pattern: str) -> list[FrameJob]:
         if groups:
             raise UsageError(f"{pattern}: the ### group needs --frames, such as --frames 1:10; or remove the group")
         return [FrameJob(None, pattern)]
+    codes = parse_frames(frames)
+    if not groups and len(codes) == 1:
+        return [FrameJob(codes[0], pattern)]
     if len(groups) != 1:
         raise UsageError(
-            f"{pattern}: with --frames the file name needs exactly one ### group, such as frame.###.png; "
+            f"{pattern}: with several --frames the file name needs exactly one ### group, such as frame.###.png; "
             f"it has {len(groups)}"
         )
-    return [FrameJob(time_code, frame_path(pattern, time_code)) for time_code in parse_frames(frames)]
+    return [FrameJob(time_code, frame_path(pattern, time_code)) for time_code in codes]
 
 
 def parse_frames(frames: str) -> list[float]:

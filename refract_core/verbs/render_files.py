@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ..errors import ImageError, UsageError
+from ..errors import ImageError, StageError, UsageError
 from ..files import write_whole
 from ..probes.digest import stale_bakes
 from ..progress import Report
@@ -48,6 +48,8 @@ class Order:
     color_correction: str = "sRGB"
     complexity: str = "low"
     skip_existing: bool = False
+    strict: bool = False
+    """A picture that shows nothing of the stage is a failure, told when all are written."""
 
 
 def render_files(order: Order, report: Report, cancel: Callable[[], bool], crew: Crew | None = None) -> None:
@@ -110,13 +112,17 @@ def _render_jobs(
     order: Order, jobs: Sequence[Any], report: Report, cancel: Callable[[], bool], crew: Crew | None
 ) -> None:
     """Read what holds for all frames, and draw them here or elsewhere. Each notice is told once."""
+    from ..rendering.picture import NOTHING_SEEN
     from ..usd.settings import read_settings
     from ..usd.stage import open_stage
 
     told: set[Notice] = set()
+    empty = False
 
     def tell(notices: Sequence[Notice]) -> None:
+        nonlocal empty
         for notice in notices:
+            empty = empty or notice.text.startswith(NOTHING_SEEN)
             if notice not in told:
                 told.add(notice)
                 report.warning(notice.path, notice.text)
@@ -132,6 +138,8 @@ def _render_jobs(
         _render_here(stage, shots, tell, report, cancel)
     else:
         _render_elsewhere(order, stage, shots, tell, report, cancel, crew)
+    if order.strict and empty:
+        raise StageError(f"{order.stage}: a picture shows nothing of the stage, which --strict does not let pass")
 
 
 Tell = Callable[[Sequence[Notice]], None]

@@ -57,12 +57,15 @@ def image_size(camera: Camera, width: int, height: int) -> tuple[int, int]:
 
 
 def view_of(
-    camera: Camera, width: int, height: int, jitter: tuple[float, float] = (0.0, 0.0), samples: int = 1
-) -> View:
+    camera: Camera, width: int, height: int, jitter: tuple[float, float] = (0.0, 0.0), samples: int = 1,
+    lens: tuple[float, float] = (0.0, 0.0),
+) -> View:  # fmt: skip
     """Conform `camera` to an image of square pixels by expanding its window, and shift it by `jitter` pixels.
 
     Args:
         samples: that share a pixel; each has that part of it for its own.
+        lens: from where on the lens to look, in the unit disc. The window moves the other way, so that what is in
+            focus stays in its place: a picture by a thin lens is the mean of those from all over it.
 
     Raises:
         UsageError: the camera has no field of view.
@@ -78,10 +81,32 @@ def view_of(
     dx, dy = jitter[0] * w / width, -jitter[1] * h / height
     m = camera.world_from_camera
     axes = np.stack([m[:3, 0], m[:3, 1], -m[:3, 2], m[:3, 3]]).astype(np.float64)
+    if camera.lens_radius > 0.0 and not camera.orthographic:
+        right_by, up_by = lens[0] * camera.lens_radius, lens[1] * camera.lens_radius
+        axes[3] += right_by * axes[0] + up_by * axes[1]
+        cx, cy = cx - right_by / camera.focus_distance, cy - up_by / camera.focus_distance
     window = np.array([cx - w / 2 + dx, cx + w / 2 + dx, cy - h / 2 + dy, cy + h / 2 + dy])
     size, clipping = np.array([width, height]), np.array(camera.clipping, np.float64)
     spread = 0.0 if camera.orthographic else w / width / math.sqrt(samples)
     return View(axes, window, size, clipping, camera.orthographic, spread)
+
+
+def lens_points(samples: int) -> list[tuple[float, float]]:
+    """Where on a lens the samples of every pixel look from, in the unit disc; a single one from its middle.
+
+    A spiral by the golden angle, which fills the disc evenly with any number of points (Vogel 1979), taken in an order
+    that has nothing to do with that of `kernels.sampling.pixel_offsets`.
+    """
+    if samples == 1:
+        return [(0.0, 0.0)]
+    stride = next(s for s in range(max(1, round(0.618 * samples)), 2 * samples) if math.gcd(s, samples) == 1)
+    turn = math.pi * (3.0 - math.sqrt(5.0))
+    points = []
+    for k in range(samples):
+        i = k * stride % samples
+        radius = math.sqrt((i + 0.5) / samples)
+        points.append((radius * math.cos(turn * i), radius * math.sin(turn * i)))
+    return points
 
 
 def corners_of(view: View) -> View:
