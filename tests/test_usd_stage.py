@@ -16,6 +16,7 @@ from pxr import Gf, Usd, UsdGeom, UsdSkel, UsdUtils
 from scene_reading import CUBE, drawn, read, signed_volume, stage_of, texts, to_stage
 
 from refract_core.errors import StageError, UsageError
+from refract_core.scene import Param
 from refract_core.usd.stage import load_stage, open_stage, scene_from_stage, time_range
 
 BALL = 'def Sphere "S" { double radius = 2 }'
@@ -260,6 +261,46 @@ def test_inherited_purposes_are_those_usd_computes(assets: Path, name: str, purp
 
 
 # --- time and what moves --------------------------------------------------------------------------------------------
+
+SPLINES = """def Sphere "S" (
+    prepend apiSchemas = ["MaterialBindingAPI"]
+) {
+    rel material:binding = </M>
+    double radius.spline = { 0: 1; post linear,
+        10: 3; post linear,
+ }
+    double xformOp:translateX.spline = { 0: 5; post linear,
+        10: 7; post linear,
+ }
+    uniform token[] xformOpOrder = ["xformOp:translateX"] }
+def Material "M" (
+    prepend apiSchemas = ["RefractMaterialAPI"]
+) {
+    uniform token refraction:model = "traced"
+    float inputs:refraction:ior.spline = { 0: 1.2; post linear,
+        10: 1.6; post linear,
+ } }
+def Camera "Cam" {
+    float focalLength.spline = { 0: 20; post linear,
+        10: 60; post linear,
+ } }
+"""
+
+
+@pytest.mark.parametrize("time", [0.0, 2.5, 10.0])
+def test_splines_are_read_at_the_time(time: float) -> None:
+    """Linear ones, whose values at a time anybody can tell: radius, place, index of refraction and focal length."""
+    scene = read(SPLINES, time_code=time)
+    share = time / 10.0
+    (ball,) = scene.spheres
+    assert ball.radius == pytest.approx(1.0 + 2.0 * share)
+    assert to_stage(scene, ball.centre)[0] == pytest.approx(5.0 + 2.0 * share, abs=1e-6)
+    assert not ball.static
+    (ior,) = (m.inputs[Param.IOR].value[0] for m in scene.materials if m.name == "/M")
+    assert ior == pytest.approx(1.2 + 0.4 * share)
+    left, right, *_ = scene.cameras[0].window
+    assert right - left == pytest.approx(20.955 / (20.0 + 40.0 * share), rel=1e-6)
+
 
 MOVING = """def Xform "X" {
     double3 xformOp:translate.timeSamples = { 10: (0, 0, 0), 20: (10, 0, 0)
