@@ -264,6 +264,33 @@ def test_varying_widths_are_linear_and_vertex_widths_follow_the_basis() -> None:
     assert found[1] == pytest.approx(3.0, rel=1e-3)
 
 
+def test_a_primvar_of_widths_wins_over_the_attribute() -> None:
+    said = widths([5.0]) + '\nfloat[] primvars:widths = [0.5] (interpolation = "constant")'
+    mesh, _ = mesh_of(curves([(0, 0, 0), (10, 0, 0)], [2], type="linear", said=said))
+    assert np.ptp(mesh.points, axis=0) == pytest.approx((10, 0.5, 0.5), rel=2e-3)
+
+
+def test_instances_of_curves_are_where_they_should_be_and_share_what_they_may_have() -> None:
+    line = curves([(0, 0, 0), (1, 0, 0)], [2], type="linear", said=widths([0.1]))
+    text = f"""def PointInstancer "I" {{
+        int[] protoIndices = [0, 0]
+        point3f[] positions = [(0, 0, 0), (0, 3, 0)]
+        rel prototypes = </I/P>
+        def Xform "P" {{ {line} }} }}"""
+    scene = read(text)
+    low = sorted(to_stage(scene, mesh.points)[:, 1].mean() for mesh in scene.meshes)
+    assert low == pytest.approx([0.0, 3.0], abs=1e-5)
+    assert len({len(mesh.triangles) for mesh in scene.meshes}) == 1
+
+
+def test_curves_that_change_in_time_are_read_at_it_and_are_not_static() -> None:
+    moving = curves([(0, 0, 0), (1, 0, 0)], [2], type="linear", said="float[] widths.timeSamples = { 0: [1], 10: [3] }")
+    for time, width in ((0.0, 1.0), (10.0, 3.0)):
+        mesh, _ = mesh_of(moving, time_code=time)
+        assert np.ptp(mesh.points[:, 1]) == pytest.approx(width, rel=1e-3)
+        assert not mesh.static
+
+
 def test_what_says_no_width_has_one_unit_and_a_notice() -> None:
     mesh, scene = mesh_of(curves([(0, 0, 0), (10, 0, 0)], [2], type="linear"))
     assert signed_volume(mesh) == pytest.approx(math.pi / 4 * 10, rel=4e-3)
@@ -447,6 +474,24 @@ def test_many_hairs_are_plain_tubes_and_say_so_and_one_is_round() -> None:
     (mesh,) = many.meshes
     assert len(mesh.triangles) == 60_000 * (3 * 2 * 3 + 2)  # 3 sides and 3 segments of a hair, and its ends
     assert "3 sides" in texts(many, "/C")
+
+
+def test_a_long_yarn_keeps_its_bends() -> None:
+    """One curve of a million points is not hair: it loses sides and some points, but no coil."""
+    turn = np.linspace(0.0, 2 * math.pi * 10_000, 1_000_000)
+    at = np.stack((np.cos(turn), np.sin(turn), turn * 0.01), axis=1)
+    stage = stage_of('def BasisCurves "C" {}')
+    prim = UsdGeom.BasisCurves(stage.GetPrimAtPath("/C"))
+    prim.CreateTypeAttr("linear")
+    prim.CreateCurveVertexCountsAttr([len(at)])
+    prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(at.astype(np.float32)))
+    prim.CreateWidthsAttr([0.01])
+    scene = scene_from_stage(stage)
+    (mesh,) = scene.meshes
+    assert len(mesh.triangles) <= 4_000_000
+    points = to_stage(scene, mesh.points)
+    assert np.hypot(points[:, 0], points[:, 1]).min() > 0.98  # chords of at least 25 to a coil
+    assert "one segment for" in texts(scene, "/C")
 
 
 def test_a_fibre_beside_fur_stays_round() -> None:

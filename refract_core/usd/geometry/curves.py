@@ -31,7 +31,6 @@ LIMIT = {2: 1_000_000, 3: 2_000_000, 4: 3_000_000, 5: 4_000_000}
 MOST = 4_000_000
 """Triangles of all curves of a stage; the plainest tubes may have as many whatever the complexity."""
 _LARGEST = 1.0e15
-_ENDLESS = 1 << 30
 
 
 class Cut(NamedTuple):
@@ -39,25 +38,25 @@ class Cut(NamedTuple):
 
     sides: int
     """of a tube"""
-    pieces: int
-    """segments of a cubic piece; a linear one needs no more than one"""
-    most: int = _ENDLESS
-    """segments of a curve"""
+    pieces: float
+    """segments of a cubic piece; a linear one needs no more than one. Under 1 some bends are left out"""
+    least: int = 1
+    """segments of a curve that has as many pieces, or a quarter of them cubic ones"""
     every: int = 1
     """Only one of so many curves is drawn, and as many times as wide."""
 
 
 CUTS = (
     *(Cut(*pair) for pair in ((128, 64), (96, 48), (64, 32), (48, 24), (32, 16), (24, 12), (16, 8), (12, 6), (8, 5))),
-    Cut(6, 4), Cut(5, 4), Cut(4, 4, 16), Cut(4, 4, 12), Cut(4, 4, 8), Cut(3, 4, 8), Cut(3, 4, 5), Cut(3, 4, 3),
-    Cut(3, 4, 2), Cut(3, 4, 1),
+    Cut(6, 4), Cut(5, 4), Cut(4, 4), Cut(4, 2, 8), Cut(3, 2, 8), Cut(3, 1, 5), Cut(3, 0.5, 5), Cut(3, 0.25, 3),
+    Cut(3, 0.125, 2), Cut(3, 0.0625), Cut(3, 0.015625), Cut(3, 0.00390625),
 )  # fmt: skip
 """From the finest to what a hair needs at least, and less."""
 _WANTED = {2: Cut(24, 12), 3: Cut(32, 16), 4: Cut(48, 24), 5: Cut(64, 32)}
 """By `Fineness.steps`."""
 _FEW = 8
 """Times `Fineness.few`: triangles of a prim under which it is as fine as may be; curves bend more than a face does."""
-_HAIR = CUTS.index(Cut(3, 4, 3))
+_HAIR = CUTS.index(Cut(3, 0.25, 3))
 
 # Rows are powers of u from 0 on, columns the four values of a piece.
 _BASES = {
@@ -255,7 +254,7 @@ def cuts_for(
         if CUTS.index(cut._replace(every=1)) > CUTS.index(_WANTED[fineness.steps]):
             coarse.setdefault(cut, []).append(str(path))
     for cut, paths in coarse.items():
-        what = f"{cut.sides} sides" + (f", at most {cut.most} segments a curve" if cut.most < _ENDLESS else "")
+        what = f"{cut.sides} sides" + (f", and one segment for {1.0 / cut.pieces:g} pieces" if cut.pieces < 1.0 else "")
         what += f", and only one in {cut.every} of its curves, as many times as wide" if cut.every > 1 else ""
         text = f"its curves are drawn with {what}: all curves together may have {LIMIT[fineness.steps]:,} triangles"
         notices.append(Notice(paths[0], f"{text}, hair up to {MOST:,} ({some_of(paths)})"))
@@ -291,7 +290,8 @@ def _size(prim: Usd.Prim, time: Usd.TimeCode) -> _Size:
 
 def _segments(pieces: Index, cut: Cut, *, cubic: bool, periodic: bool) -> Index:
     """Segments of curves of so many pieces; a closed one has three at least."""
-    found = np.minimum(pieces * (cut.pieces if cubic else 1), cut.most)
+    few = np.minimum(cut.least, pieces * 4 if cubic else pieces)
+    found = np.maximum(np.ceil(pieces * (cut.pieces if cubic else min(cut.pieces, 1.0))).astype(np.int64), few)
     return np.where(pieces > 0, np.maximum(found, 3 if periodic else 1), 0)
 
 
