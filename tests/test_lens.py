@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scenes import camera, draw, glass, material, quad, scene
 
 import refract_core as rc
+from refract_core.errors import StageError
+from refract_core.progress import Report
 from refract_core.rendering.picture import NOTHING_SEEN
 from refract_core.scene import Camera, Model, Scene, Sphere
+from refract_core.verbs.render_files import Order, render_files
 
 FOCUS, RADIUS = 4.0, 0.1
 EYE = camera((0, 0, 4), (0, 0, 0), 0.25)
@@ -94,3 +99,34 @@ def test_a_picture_of_nothing_says_so() -> None:
 
     assert said(away)
     assert not said(EYE)
+
+
+def test_strict_fails_on_a_picture_of_nothing_and_writes_it_all_the_same(tmp_path: Path) -> None:
+    """One camera has the ball behind it, the other before it."""
+    stage = tmp_path / "away.usda"
+    text = """#usda 1.0
+        (
+            metersPerUnit = 1
+            upAxis = "Y"
+        )
+        def Sphere "Ball"
+        {
+        }
+        def Camera "Cam"
+        {
+            double3 xformOp:translate = (0, 0, %s)
+            uniform token[] xformOpOrder = ["xformOp:translate"]
+        }
+        """
+    heard: list[str] = []
+    report = Report(lambda *_: None, lambda _, said: heard.append(said), lambda *_: None, lambda _: None)
+    for place, empty in (("-9", True), ("9", False)):
+        stage.write_text(text % place, encoding="utf-8")
+        for strict in (False, True):
+            out = tmp_path / f"{place}{strict}.png"
+            asked = Order(stage=str(stage), out=str(out), overrides={"image_width": 16, "samples": 1}, strict=strict)
+            with pytest.raises(StageError, match="--strict") if strict and empty else nullcontext():
+                render_files(asked, report, lambda: False)
+            assert out.exists()
+        assert any(said.startswith(NOTHING_SEEN) for said in heard) == empty
+        heard.clear()
