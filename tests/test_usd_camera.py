@@ -193,6 +193,8 @@ def test_a_shutter_that_stays_open_is_named_where_something_moves() -> None:
     assert "motion blur is not drawn" in texts(read(still + camera_text(extra=SHUTTER + "\n" + MOVES)), "/Cam")
     assert not texts(read(still + camera_text(extra=SHUTTER)), "/Cam")
     assert not texts(read(moving + camera_text()), "/Cam")
+    off = 'def RenderSettings "R" { bool disableMotionBlur = 1 }'
+    assert not texts(read(moving + camera_text(extra=SHUTTER) + off, head=HEAD), "/Cam")
     closed = SHUTTER.replace("-0.25", "0.25")
     assert not texts(read(moving + camera_text(extra=closed)), "/Cam")
 

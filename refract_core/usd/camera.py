@@ -211,7 +211,9 @@ def choose_camera(
 def _frozen(camera: UsdGeom.Camera, time: Usd.TimeCode, moving: bool) -> Iterator[Notice]:
     """Says that a shutter stays open while things move, which is not drawn."""
     opens, closes = (attribute.Get(time) for attribute in (camera.GetShutterOpenAttr(), camera.GetShutterCloseAttr()))
-    if opens == closes or not (moving or _moves(camera.GetPrim())):
+    settings = UsdRender.Settings.GetStageRenderSettings(camera.GetPrim().GetStage())
+    off = settings and settings.GetDisableMotionBlurAttr().Get(Usd.TimeCode.EarliestTime())
+    if off or opens == closes or not (moving or _moves(camera.GetPrim())):
         return
     text = f"its shutter is open from {opens:g} to {closes:g} while things move, but motion blur is not drawn: "
     yield Notice(str(camera.GetPath()), text + "everything stands still at the time of the frame")

@@ -254,7 +254,9 @@ def cuts_for(
         if CUTS.index(cut._replace(every=1)) > CUTS.index(_WANTED[fineness.steps]):
             coarse.setdefault(cut, []).append(str(path))
     for cut, paths in coarse.items():
-        what = f"{cut.sides} sides" + (f", and one segment for {1.0 / cut.pieces:g} pieces" if cut.pieces < 1.0 else "")
+        what = f"{cut.sides} sides"
+        if cut.pieces < 1.0:
+            what += f" and one segment for {1.0 / cut.pieces:g} pieces, {cut.least} of a curve at least"
         what += f", and only one in {cut.every} of its curves, as many times as wide" if cut.every > 1 else ""
         text = f"its curves are drawn with {what}: all curves together may have {LIMIT[fineness.steps]:,} triangles"
         notices.append(Notice(paths[0], f"{text}, hair up to {MOST:,} ({some_of(paths)})"))
