@@ -15,8 +15,9 @@ from scene_reading import F64, areas, read, signed_volume, stage_of, texts, to_s
 
 import refract_core as rc
 from refract_core.scene import F32, Mesh, Model, Scene
+from refract_core.usd.geometry.along import Along
 from refract_core.usd.geometry.cages import FINENESS
-from refract_core.usd.geometry.curves import Along, read_curves
+from refract_core.usd.geometry.curves import read_curves
 from refract_core.usd.geometry.triangulate import is_closed
 from refract_core.usd.stage import scene_from_stage
 

@@ -1,14 +1,9 @@
-"""BasisCurves and HermiteCurves as tubes or ribbons: which pieces their points make, and how finely each is cut.
-
-Source of the rules: OpenUSD's schema of UsdGeomBasisCurves (segments, phantom points, sizes of primvars).
-"""
+"""BasisCurves and HermiteCurves read and checked, and made tubes or ribbons; how finely each is cut."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +11,7 @@ from numpy.typing import NDArray
 from pxr import Sdf, Usd, UsdGeom
 
 from ...scene import F32, F64, Notice
+from .along import BASES, STRAIGHT, Along, Rule
 from .cages import integers
 from .primvars import Topology, Unusable, as_values
 from .refined import Fineness
@@ -57,143 +53,6 @@ _WANTED = {2: Cut(24, 12), 3: Cut(32, 16), 4: Cut(48, 24), 5: Cut(64, 32)}
 _FEW = 8
 """Times `Fineness.few`: triangles of a prim under which it is as fine as may be; curves bend more than a face does."""
 _HAIR = CUTS.index(Cut(3, 0.25, 3))
-
-# Rows are powers of u from 0 on, columns the four values of a piece.
-_BASES = {
-    "linear": np.array([[1, 0, 0, 0], [-1, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]], np.float64),
-    "bezier": np.array([[1, 0, 0, 0], [-3, 3, 0, 0], [3, -6, 3, 0], [-1, 3, -3, 1]], np.float64),
-    "bspline": np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]], np.float64) / 6.0,
-    "catmullRom": np.array([[0, 2, 0, 0], [-1, 0, 1, 0], [2, -5, 4, -1], [-1, 3, -3, 1]], np.float64) / 2.0,
-}
-_STRAIGHT = "linear"
-
-
-class Rule(NamedTuple):
-    """What kind of curves a prim has."""
-
-    basis: str
-    """a name in `_BASES`, or hermite"""
-    wrap: str
-
-    @property
-    def periodic(self) -> bool:
-        return self.wrap == UsdGeom.Tokens.periodic
-
-    @property
-    def phantoms(self) -> bool:
-        """One more point before the first and after the last, which nobody authors."""
-        return self.wrap == UsdGeom.Tokens.pinned and self.basis in ("bspline", "catmullRom")
-
-    def pieces(self, counts: Index) -> Index:
-        """Pieces of curves of so many points; 0 where a curve cannot have so many."""
-        if self.basis in (_STRAIGHT, "hermite"):
-            return np.where(counts >= 3, counts, 0) if self.periodic else np.maximum(counts - 1, 0)
-        if self.basis == "bezier":
-            if self.periodic:
-                return np.where(counts % 3 == 0, counts // 3, 0)
-            return np.where((counts >= 4) & ((counts - 4) % 3 == 0), (counts - 4) // 3 + 1, 0)
-        if self.periodic:
-            return np.where(counts >= 3, counts, 0)
-        return np.maximum(counts - 1 if self.phantoms else counts - 3, 0)
-
-    @property
-    def needs(self) -> str:
-        """In words, what a count must be."""
-        if self.basis in (_STRAIGHT, "hermite"):
-            return "3 or more" if self.periodic else "2 or more"
-        if self.basis == "bezier":
-            return "a multiple of 3" if self.periodic else "4, 7, 10 ..."
-        return "3 or more" if self.periodic else ("2 or more" if self.phantoms else "4 or more")
-
-
-@dataclass(frozen=True)
-class Along:
-    """Where the rings of a prim's curves are, and what values of every interpolation are there."""
-
-    rule: Rule
-    curves: Index
-    """shape (C,): the curves that are drawn, by their number in the prim"""
-    counts: Index
-    """shape (A,): points of every curve of the prim, drawn or not"""
-    ring_curve: Index
-    """shape (N,): place in `curves`"""
-    piece: Index
-    """shape (N,): number of the piece in its curve"""
-    u: F64
-    """shape (N,): place in the piece, 0 .. 1"""
-
-    @cached_property
-    def pieces(self) -> Index:
-        """shape (A,)"""
-        return self.rule.pieces(self.counts)
-
-    @cached_property
-    def starts(self) -> Index:
-        """shape (A,): first point of every curve"""
-        return np.cumsum(self.counts) - self.counts
-
-    @property
-    def varying_count(self) -> int:
-        return int(self._varying_counts.sum())
-
-    @property
-    def _varying_counts(self) -> Index:
-        return self.pieces + (0 if self.rule.periodic else 1)
-
-    def at_rings(self, values: F64, interpolation: str) -> F64:
-        """Values (K, D) of an interpolation at every ring, shape (N, D)."""
-        if interpolation == UsdGeom.Tokens.constant:
-            return np.broadcast_to(values[:1], (len(self.u), values.shape[1]))
-        number = self.curves[self.ring_curve]
-        if interpolation == UsdGeom.Tokens.uniform:
-            return values[number]
-        if interpolation == UsdGeom.Tokens.vertex and self.rule.basis != "hermite":
-            return self.evaluated(values, self.piece, self.u)
-        if interpolation == UsdGeom.Tokens.vertex:
-            starts, around = self.starts[number], self.counts[number]
-        else:
-            every = self._varying_counts
-            starts, around = (np.cumsum(every) - every)[number], every[number]
-        following = (self.piece + 1) % around
-        share = self.u[:, None]
-        return (1.0 - share) * values[starts + self.piece] + share * values[starts + following]
-
-    def corners(self, values: F32, interpolation: str) -> tuple[F32, Index]:
-        """As `Refinement.corners`: values at every ring, and which of them each ring takes."""
-        found = self.at_rings(values.astype(np.float64), interpolation)
-        return np.ascontiguousarray(found, np.float32), np.arange(len(self.u))
-
-    def evaluated(self, values: F64, piece: Index, u: F64, *, derivative: bool = False) -> F64:
-        """Values (P, D) of the points, by the basis, somewhere on every ring's own curve; or how they change with u."""
-        one = np.ones_like(u)
-        power = (0.0 * u, one, 2.0 * u, 3.0 * u * u) if derivative else (one, u, u * u, u * u * u)
-        weights = np.stack(power, axis=1) @ _BASES["bezier" if self.rule.basis == "hermite" else self.rule.basis]
-        values, columns = self._columns(values, piece)
-        found: F64 = weights[:, :1] * values[columns[0]]
-        for k in range(1, len(columns)):
-            found += weights[:, k : k + 1] * values[columns[k]]
-        return found
-
-    def _columns(self, values: F64, piece: Index) -> tuple[F64, list[Index]]:
-        """Values with what nobody authors behind them, and the rows of each piece's two or four."""
-        number = self.curves[self.ring_curve]
-        start, count = self.starts[number], self.counts[number]
-        if self.rule.basis == "hermite":  # controls: the points, those after them and those before them
-            third = len(values) // 3
-            following = start + (piece + 1) % count
-            return values, [start + piece, third + start + piece, 2 * third + following, following]
-        if self.rule.phantoms:
-            first = self.starts[self.curves]
-            last = first + self.counts[self.curves] - 1
-            before = 2.0 * values[first] - values[first + 1]
-            behind = 2.0 * values[last] - values[last - 1]
-            rows = [start + piece + k for k in (-1, 0, 1, 2)]
-            rows[0] = np.where(piece == 0, len(values) + self.ring_curve, rows[0])
-            rows[3] = np.where(piece == count - 2, len(values) + len(first) + self.ring_curve, rows[3])
-            return np.concatenate((values, before, behind)), rows
-        step = 3 if self.rule.basis == "bezier" else 1
-        width = 2 if self.rule.basis == _STRAIGHT else 4
-        return values, [start + (step * piece + k) % count for k in range(width)]
 
 
 class Drawn(NamedTuple):
@@ -287,7 +146,7 @@ def _size(prim: Usd.Prim, time: Usd.TimeCode) -> _Size:
     rule = _rule(prim, time)
     counts = integers(UsdGeom.Curves(prim).GetCurveVertexCountsAttr().Get(time))
     pieces = rule.pieces(counts.clip(0))
-    return _Size(pieces, rule.basis != _STRAIGHT, rule.periodic, _authored(prim, "normals", time) is not None)
+    return _Size(pieces, rule.basis != STRAIGHT, rule.periodic, _authored(prim, "normals", time) is not None)
 
 
 def _segments(pieces: Index, cut: Cut, *, cubic: bool, periodic: bool) -> Index:
@@ -333,11 +192,11 @@ def _rule(prim: Usd.Prim, time: Usd.TimeCode) -> Rule:
         return Rule("hermite", str(UsdGeom.Tokens.nonperiodic))
     curves = UsdGeom.BasisCurves(prim)
     kind, basis = str(curves.GetTypeAttr().Get(time)), str(curves.GetBasisAttr().Get(time))
-    return Rule(_STRAIGHT if kind == UsdGeom.Tokens.linear else basis, str(curves.GetWrapAttr().Get(time)))
+    return Rule(STRAIGHT if kind == UsdGeom.Tokens.linear else basis, str(curves.GetWrapAttr().Get(time)))
 
 
 def _checked(rule: Rule) -> None:
-    if rule.basis != "hermite" and rule.basis not in _BASES:
+    if rule.basis != "hermite" and rule.basis not in BASES:
         raise Unusable(f"its basis is '{rule.basis}'; it must be bezier, bspline or catmullRom")
     if rule.wrap not in (UsdGeom.Tokens.nonperiodic, UsdGeom.Tokens.periodic, UsdGeom.Tokens.pinned):
         raise Unusable(f"its wrap is '{rule.wrap}'; it must be nonperiodic, periodic or pinned")
@@ -404,7 +263,7 @@ def _hermite(prim: Usd.Prim, time: Usd.TimeCode, points: F64) -> F64:
 def _rings(rule: Rule, controls: F64, counts: Index, kept: Index, cut: Cut) -> tuple[Along, Rings]:
     """Places evenly along the curves; curves without a length are left out."""
     pieces = rule.pieces(counts)[kept]
-    segments = _segments(pieces, cut, cubic=rule.basis != _STRAIGHT, periodic=rule.periodic)
+    segments = _segments(pieces, cut, cubic=rule.basis != STRAIGHT, periodic=rule.periodic)
     ring_counts = segments + (0 if rule.periodic else 1)
     owner = np.repeat(np.arange(len(kept)), ring_counts)
     step = (np.arange(len(owner)) - np.repeat(np.cumsum(ring_counts) - ring_counts, ring_counts)) * pieces[owner]
@@ -448,7 +307,7 @@ def _directed(along: Along, controls: F64, centres: F64, counts: Index) -> Rings
     if not rule.periodic:
         leaving[starts + counts - 1] = coming[starts + counts - 1]
         coming[starts] = leaving[starts]
-    if rule.basis == _STRAIGHT:
+    if rule.basis == STRAIGHT:
         return rings._replace(before=directions(coming, leaving), after=directions(leaving, coming))
     slope = along.evaluated(controls, along.piece, along.u, derivative=True)
     after = directions(slope, leaving)
