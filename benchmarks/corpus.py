@@ -9,8 +9,9 @@ Each is drawn by a process of its own, so that a crash is a row like any other. 
     sheet-NN.jpg              what we draw, with somebody else's picture beside it where one lies beside the stage
     pictures/                 what we draw
 
-A cause is a reason why a picture may differ from what usdview shows, by what the reader itself said (`CAUSES`), or by what
-came of it: a crash, too long, nothing seen. What nobody said has no cause here; the sheets are there to be looked at.
+A cause is a reason why a picture may differ from what usdview shows, by what the reader itself said (`CAUSES`), or by
+what came of it: a crash, too long, nothing seen. What nobody said has no cause here; the sheets are there to be
+looked at.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ CAUSES = (
     Cause("instances", r"instance|prototype"),
     Cause("MaterialX", r"^MaterialX |mtlx"),
     Cause("MDL", r"^MDL "),
-    Cause("shader of one renderer", r"shader .*(arnold|ri:|renderman|karma|not known)|is not known here|no surface shader"),
+    Cause("shader of one renderer", r"shader .*(arnold|ri:|renderman|karma|not known)|no surface shader"),
     Cause("texture", r"texture|picture|UDIM|colou?rSpace|wrap"),
     Cause("UDIM", r"UDIM"),
     Cause("light", r"\b\w*Light\w* is not|light.*(ignored|skipped|not drawn)|lightFilter|portal"),
@@ -98,9 +99,11 @@ def beside(stage: Path, stages: Sequence[Path]) -> Path | None:
             continue
         shows = home.name.lower() in BESIDE
         pictures = [path for path in home.iterdir() if path.suffix.lower() in PICTURES]
-        named = [path for path in pictures if shows or path.stem.lower().startswith(BESIDE + ("thumbnail",))]
+        named = [path for path in pictures if shows or path.stem.lower().startswith((*BESIDE, "thumbnail"))]
         for path in [*named, *(path for path in pictures if path.stem == stage.stem)]:
             found.append((_unlike(stage.stem, path.stem), path.name, path))
+    others = {other.stem for other in stages if other.stem != stage.stem}
+    found = [one for one in found if one[0] == 0 or one[2].stem not in others]  # nobody else's own
     if not found:
         return None
     unlike, _, best = min(found)
@@ -143,7 +146,8 @@ def draw(stage: str, out: str, width: int) -> dict[str, Any]:
             stage = flat
         opened = open_stage(stage)
         authored = read_settings(opened, "", notices)
-        settings = RenderSettings(**{**authored, **QUALITIES["good"], "image_width": width, "image_height": 0, "jobs": 1})  # type: ignore[arg-type]
+        small = {"image_width": width, "image_height": 0, "jobs": 1}
+        settings = RenderSettings(**{**authored, **QUALITIES["good"], **small})
         scene = scene_from_stage(opened, purposes=settings.purposes, camera=settings.camera)
         read = time.perf_counter()
         frame = render(scene, settings)
@@ -194,8 +198,8 @@ def _fitted(path: Path | None) -> Image.Image:
     if path is None:
         return cell
     try:
-        with Image.open(path) as picture:
-            picture = picture.convert("RGBA")
+        with Image.open(path) as file:
+            picture = file.convert("RGBA")
             picture.thumbnail((_CELL, _CELL))
             cell.paste(picture, ((_CELL - picture.width) // 2, (_CELL - picture.height) // 2), picture)
     except OSError:  # a format that Pillow does not know, or a file that is no picture
@@ -205,7 +209,7 @@ def _fitted(path: Path | None) -> Image.Image:
 
 def sheets(rows: Sequence[dict[str, Any]], out: Path) -> list[str]:
     """Write contact sheets: two stages a line, ours on the left and the other picture on the right. Returns names."""
-    names = []
+    names: list[str] = []
     each = _COLUMNS // 2 * _ROWS
     for first in range(0, len(rows), each):
         sheet = Image.new("RGB", (_COLUMNS * _CELL, _ROWS * (_CELL + 28)), (30, 30, 30))
@@ -231,7 +235,8 @@ def table_of_causes(rows: Sequence[dict[str, Any]]) -> list[tuple[str, int]]:
 def page(folder: str, rows: Sequence[dict[str, Any]], names: Sequence[str]) -> str:
     """index.md."""
     lines = [f"# {len(rows)} stages of {folder}", "", *(f"[{name}]({name})" for name in names), ""]
-    lines += ["| cause | stages |", "|---|---|", *(f"| {name} | {count} |" for name, count in table_of_causes(rows)), ""]
+    causes = (f"| {name} | {count} |" for name, count in table_of_causes(rows))
+    lines += ["| cause | stages |", "|---|---|", *causes, ""]
     lines += ["| stage | s | triangles | notices | cause |", "|---|---|---|---|---|"]
     for row in rows:
         cause = ", ".join(row["causes"]) + (f": {row['error']}" if row["error"] else "")

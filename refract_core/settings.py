@@ -47,6 +47,22 @@ def named_settings(quality: str = "", preset: str = "") -> dict[str, Any]:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Opening:
+    """What a person changes about a stage as it is opened; no file of it is."""
+
+    variants: tuple[str, ...] = ()
+    """`/Prim{set=name}`, chosen one after the other"""
+    session_layer: str = ""
+    """Path of a layer whose opinions are stronger than all of the stage"""
+    mask: tuple[str, ...] = ()
+    """Prim paths: they, what is below them and above them is all that the stage then has, and the materials of it"""
+
+
+AS_IT_IS = Opening()
+"""Nothing is changed."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class RenderSettings:
     """Settings of one frame. Checked when made; an error names the field."""
 

@@ -163,8 +163,9 @@ def _render(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[s
     from refract_core.rendering.picture import render
     from refract_core.rendering.ready import choose_camera
     from refract_core.rendering.session import Session
+    from refract_core.usd.opening import select_variants
     from refract_core.usd.settings import read_settings
-    from refract_core.usd.stage import open_stage, scene_from_stage, select_variants
+    from refract_core.usd.stage import open_stage, scene_from_stage
     from refract_core.verbs.render_files import chosen_settings
     from refract_core.view.camera import image_size
 

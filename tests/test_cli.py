@@ -37,11 +37,14 @@ class Engine:
     authored: dict[str, object] = field(default_factory=dict)
     during: Callable[[Callable[[], bool]], None] = lambda _cancel: None
 
-    def open_stage(self, path: str) -> str:
+    def open_stage(self, path: str, _opening: object = None) -> str:
         self.stages.append(path)
         return path
 
-    def read_settings(self, _stage: str, prim_path: str = "", _notices: object = None) -> dict[str, object]:
+    def read_settings(
+        self, _stage: str, prim_path: str = "", _notices: object = None, *, products: bool = False
+    ) -> dict[str, object]:
+        assert products
         self.settings_prims.append(prim_path)
         return self.authored
 
@@ -75,6 +78,8 @@ def engine(monkeypatch: pytest.MonkeyPatch) -> Engine:
     monkeypatch.setattr(stage, "open_stage", engine.open_stage)
     monkeypatch.setattr(stage, "scene_from_stage", engine.scene_from_stage)
     monkeypatch.setattr(importlib.import_module("refract_core.usd.settings"), "read_settings", engine.read_settings)
+    products = importlib.import_module("refract_core.usd.products")
+    monkeypatch.setattr(products, "read_products", lambda *_: [])
     monkeypatch.setattr(importlib.import_module("refract_core.rendering.picture"), "render", engine.render)
     return engine
 

@@ -72,9 +72,15 @@ def test_unknown_path_names_the_flag_and_the_choices(path: str) -> None:
         read_settings(stage_of(FULL), path)
 
 
-def test_unknown_path_in_the_metadata_names_the_metadata() -> None:
-    with pytest.raises(StageError, match=r"renderSettingsPrimPath names /Gone, which does not exist"):
-        read_settings(stage_of('#usda 1.0\n(\n    renderSettingsPrimPath = "/Gone"\n)\n'))
+@pytest.mark.parametrize(("path", "why"), [("/Gone", "does not exist"), ("/S", "is a Scope, not a RenderSettings")])
+def test_a_path_in_the_metadata_that_names_nothing_is_a_warning(path: str, why: str) -> None:
+    """usdrecord draws such a stage, too."""
+    notices: list[Notice] = []
+    stage = stage_of(f'#usda 1.0\n(\n    renderSettingsPrimPath = "{path}"\n)\ndef Scope "S" {{}}\n')
+    assert read_settings(stage, "", notices) == {}
+    ((where, text),) = [(notice.path, notice.text) for notice in notices]
+    assert where == "/"
+    assert text.startswith(f"renderSettingsPrimPath names {path}, which {why}; the defaults are used")
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -13,16 +14,25 @@ import typer
 
 from ..errors import RefractError, UsageError
 from ..progress import Report, reporting
-from ..settings import RenderSettings
+from ..settings import Opening, RenderSettings
 from ..version import __version__
 
 CANCELLED = 3
+
+_HUMP = re.compile(r"(?<=[a-z0-9])[A-Z]")
+
+
+def _in_kebab(name: str) -> str:
+    """Options are known in the spelling of usdrecord, too: `--sessionLayer` is `--session-layer`."""
+    return _HUMP.sub(lambda found: f"-{found[0].lower()}", name)
+
 
 app = typer.Typer(
     help="Render USD stages with glass in them, without a GPU or a display.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    context_settings={"token_normalize_func": _in_kebab},
     rich_markup_mode=None,  # the boxes cut long option names off
 )
 
@@ -48,6 +58,37 @@ ProgressMode = Annotated[
         help="How progress is told on stderr: auto is a bar on a terminal, json is one object per line.",
     ),
 ]
+
+
+Variant = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--variant",
+        metavar="/PRIM{SET=NAME}",
+        help="Choose a variant, over what the stage says; may be repeated, outer ones first. Quote it for the shell.",
+    ),
+]
+SessionLayer = Annotated[
+    str,
+    typer.Option(
+        "--session-layer",
+        metavar="FILE",
+        help="A layer whose opinions are stronger than all of the stage, as usdrecord has it.",
+    ),
+]
+Mask = Annotated[
+    str,
+    typer.Option(
+        metavar="PATH,...",
+        help="Open only these prims, with what is below them and the materials they are bound to. Name the camera and "
+        "the lights too, if they are to be there.",
+    ),
+]
+
+
+def opening_of(variant: list[str] | None, session_layer: str, mask: str) -> Opening:
+    """What the three options say."""
+    return Opening(variants=tuple(variant or ()), session_layer=session_layer, mask=words(mask))
 
 
 def only_option(what: str) -> Any:

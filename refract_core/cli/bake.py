@@ -7,7 +7,19 @@ from typing import Annotated
 import typer
 
 from ..verbs.executors import crew_at
-from .app import Jobs, ProgressMode, StagePath, app, only_option, outcome, words
+from .app import (
+    Jobs,
+    Mask,
+    ProgressMode,
+    SessionLayer,
+    StagePath,
+    Variant,
+    app,
+    only_option,
+    opening_of,
+    outcome,
+    words,
+)
 
 bake = typer.Typer(help="Work something out once and keep it in a layer over the stage.", no_args_is_help=True)
 app.add_typer(bake, name="bake", rich_help_panel=None)
@@ -59,6 +71,9 @@ def bake_probes_command(
     force: Force = False,
     skip_existing: SkipExisting = False,
     overwrite: Overwrite = False,
+    variant: Variant = None,
+    session_layer: SessionLayer = "",
+    mask: Mask = "",
     jobs: Jobs = None,
     executor: Executor = "",
     progress: ProgressMode = "auto",
@@ -82,6 +97,7 @@ def bake_probes_command(
         force=force,
         skip_existing=skip_existing,
         overwrite=overwrite,
+        opening=opening_of(variant, session_layer, mask),
     )
     with outcome(progress) as (report, cancel), crew_at(executor) as crew:
         bake_probes(order, report, cancel, crew=crew)
@@ -122,6 +138,9 @@ def bake_thickness_command(
     along: Along = "normal",
     texture: Texture = 0,
     overwrite: Overwrite = False,
+    variant: Variant = None,
+    session_layer: SessionLayer = "",
+    mask: Mask = "",
     jobs: Jobs = None,
     progress: ProgressMode = "auto",
 ) -> None:
@@ -135,6 +154,7 @@ def bake_thickness_command(
 
     with outcome(progress) as (report, cancel):
         order = ThicknessOrder(
-            stage=stage, out=out, only=words(only), along=along, texture=texture, jobs=jobs or 0, overwrite=overwrite
+            stage=stage, out=out, only=words(only), along=along, texture=texture, jobs=jobs or 0, overwrite=overwrite,
+            opening=opening_of(variant, session_layer, mask),
         )
         bake_thickness(order, report, cancel)

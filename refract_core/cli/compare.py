@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..errors import UsageError
-from .app import Jobs, ProgressMode, app, outcome, words
+from .app import Jobs, Mask, ProgressMode, SessionLayer, Variant, app, opening_of, outcome, words
 from .render import (
     Camera,
     DisableCameraLight,
@@ -82,6 +82,9 @@ def compare_command(
     exposure: Exposure = None,
     disable_camera_light: DisableCameraLight = False,
     render_settings_prim_path: SettingsPrim = "",
+    variant: Variant = None,
+    session_layer: SessionLayer = "",
+    mask: Mask = "",
     suggest: Suggest = False,
     write: Write = "",
     fail_under: FailUnder = None,
@@ -118,7 +121,7 @@ def compare_command(
                 raise UsageError(f"{third}: is one word too many; a stage takes one folder, as in STAGE OUTDIR")
             draws = {
                 "settings_prim": render_settings_prim_path, "time_code": frame, "reference_samples": reference_samples,
-                "suggest": suggest, "write": write,
+                "suggest": suggest, "write": write, "opening": opening_of(variant, session_layer, mask),
             }  # fmt: skip
             account = _of_stage(first, second, {**how, **draws, "overrides": given}, report, cancel)
             out = second
@@ -127,6 +130,7 @@ def compare_command(
                 "--suggest": suggest, "--write": write, "--frame": frame is not None,
                 "--reference-samples": reference_samples != SAMPLES, "--disable-camera-light": disable_camera_light,
                 "--render-settings-prim-path": render_settings_prim_path,
+                "--variant": variant, "--session-layer": session_layer, "--mask": mask,
             }  # fmt: skip
             named = [f"--{name.replace('_', '-')}" for name in given if name not in ("camera_light", "jobs")]
             _refuse(first, [*named, *(flag for flag, is_given in flags.items() if is_given)])

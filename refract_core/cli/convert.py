@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..models import MODELS
-from .app import ProgressMode, app, only_option, outcome, words
+from .app import Mask, ProgressMode, SessionLayer, Variant, app, only_option, opening_of, outcome, words
 
 if TYPE_CHECKING:
     from ..verbs.convert import Converted, ConvertOrder, Row
@@ -65,6 +65,9 @@ def convert_command(
     thickness: Thickness = "typed",
     to: To = "",
     overwrite: Overwrite = False,
+    variant: Variant = None,
+    session_layer: SessionLayer = "",
+    mask: Mask = "",
     as_json: Json = False,
     progress: ProgressMode = "auto",
 ) -> None:
@@ -78,7 +81,7 @@ def convert_command(
     with outcome(progress) as (report, cancel):
         order = ConvertOrder(
             stage=stage, out=out, flatten=flatten, model=model, only=words(only), thickness=thickness, to=to,
-            overwrite=overwrite,
+            overwrite=overwrite, opening=opening_of(variant, session_layer, mask),
         )  # fmt: skip
         found = convert(order, report.progress, cancel)
         for notice in found.notices:

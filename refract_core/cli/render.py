@@ -12,7 +12,7 @@ from ..settings import PRESETS, QUALITIES
 from ..verbs.executors import crew_at
 from ..verbs.override import COLORS, RANGES
 from ..verbs.render_files import Order, render_files
-from .app import Jobs, ProgressMode, app, outcome, words
+from .app import Jobs, Mask, ProgressMode, SessionLayer, Variant, app, opening_of, outcome, words
 
 Stage = Annotated[
     str, typer.Argument(metavar="STAGE", help="The .usd, .usda, .usdc or .usdz file to render, or a .mtlx file.")
@@ -20,9 +20,11 @@ Stage = Annotated[
 Out = Annotated[
     str,
     typer.Argument(
-        metavar="OUT",
+        metavar="[OUT]",
+        show_default=False,
         help="The picture to write: .exr holds all AOVs, .png, .jpg, .webp and .tif hold one. With several --frames "
-        "the file name has one ### group, such as shot.###.png, or shot.###.##.png for fractions of a frame.",
+        "the file name has one ### group, such as shot.###.png, or shot.###.##.png for fractions of a frame. Without "
+        "OUT, the RenderProducts of the stage's RenderSettings are written, each under its productName.",
     ),
 ]
 Camera = Annotated[
@@ -210,7 +212,7 @@ Strict = Annotated[
 @app.command()
 def render(
     stage: Stage,
-    out: Out,
+    out: Out = "",
     camera: Camera = None,
     frames: Frames = "",
     image_width: ImageWidth = None,
@@ -236,6 +238,9 @@ def render(
     disable_camera_light: DisableCameraLight = False,
     disable_emission_light: DisableEmissionLight = False,
     render_settings_prim_path: SettingsPrim = "",
+    variant: Variant = None,
+    session_layer: SessionLayer = "",
+    mask: Mask = "",
     jobs: Jobs = None,
     executor: Executor = "",
     tile_size: TileSize = None,
@@ -280,6 +285,7 @@ def render(
             complexity=complexity,
             skip_existing=skip_existing,
             strict=strict,
+            opening=opening_of(variant, session_layer, mask),
         )
         render_files(order, report, cancel, crew)
 

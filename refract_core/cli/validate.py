@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import os
 from typing import Annotated
 
 import typer
 
-from .app import app, outcome
+from ..errors import UsageError
+from .app import Mask, SessionLayer, Variant, app, opening_of, outcome
 
-Stage = Annotated[str, typer.Argument(metavar="STAGE", help="The .usd, .usda, .usdc or .usdz file to check.")]
+Stages = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="STAGE",
+        help="The .usd, .usda, .usdc or .usdz files to check. A folder means every such file below it.",
+    ),
+]
 Fix = Annotated[
     str,
     typer.Option(
@@ -18,19 +26,71 @@ Fix = Annotated[
     ),
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace OUT if it exists.")]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON: every finding with rule, severity, path, text, fix.")]
+Strict = Annotated[bool, typer.Option("--strict", help="Let warnings fail, too.")]
+Form = Annotated[
+    str,
+    typer.Option(
+        "--format",
+        metavar="text|json|junit|sarif",
+        help="json has every finding with rule, severity, path, text, fix; junit and sarif (2.1.0) are for CI systems.",
+    ),
+]
+Json = Annotated[bool, typer.Option("--json", help="The same as --format json.")]
 
 
 @app.command()
-def validate(stage: Stage, fix: Fix = "", overwrite: Overwrite = False, json: Json = False) -> None:
-    """Check a stage: glass, probes, and what USD's own validators find.
+def validate(
+    stages: Stages,
+    fix: Fix = "",
+    overwrite: Overwrite = False,
+    strict: Strict = False,
+    form: Form = "text",
+    json: Json = False,
+    variant: Variant = None,
+    session_layer: SessionLayer = "",
+    mask: Mask = "",
+) -> None:
+    """Check stages: glass, probes, names in our namespaces, and what USD's own validators find.
 
-    Exit code 1 when errors remain; warnings do not fail.
+    Of several stages, one that cannot be read is an error, and the others are checked all the same.
+
+    Exit codes: 0 nothing fails, 1 errors are found (with --strict also warnings), or the only stage cannot be opened,
+    2 wrong usage, 3 cancelled.
     """
     from ..verbs import validate as room
+    from ..verbs import validate_forms as forms
+    from ..verbs import validate_many as many
 
+    opening = opening_of(variant, session_layer, mask)
+    verdicts: list[room.Verdict] = []
     with outcome("none") as (_report, cancel):
-        verdict = room.validate(room.ValidateOrder(stage=stage, fix=fix, overwrite=overwrite), cancel)
-    typer.echo(room.to_json(verdict) if json else room.to_text(verdict))
-    if not verdict.passed:
+        shape = _shape(form, json, forms.FORMATS)
+        named = many.stages_named(stages)
+        alone = len(stages) == 1 and not os.path.isdir(stages[0])
+        if fix and not alone:
+            raise UsageError("--fix writes one layer over one stage; name one file")
+        if alone and (fix or shape in ("text", "json")):
+            order = room.ValidateOrder(stage=named[0], fix=fix, overwrite=overwrite, opening=opening)
+            verdicts.append(room.validate(order, cancel))
+        else:
+            for verdict in many.validate_each(named, opening, cancel):
+                verdicts.append(verdict)
+                if shape == "text":
+                    typer.echo(room.to_text(verdict))
+    if shape == "text":
+        typer.echo(room.to_text(verdicts[0]) if alone else room.summary(verdicts))
+    elif shape == "json":
+        typer.echo(room.to_json(verdicts[0]) if alone else forms.to_json_of_many(verdicts))
+    else:
+        typer.echo(forms.to_junit(verdicts, strict=strict) if shape == "junit" else forms.to_sarif(verdicts))
+    if any(forms.fails(finding, strict=strict) for verdict in verdicts for finding in verdict.findings):
         raise typer.Exit(1)
+
+
+def _shape(form: str, json: bool, known: tuple[str, ...]) -> str:
+    """The form that was asked for. Raises UsageError."""
+    if form not in known:
+        raise UsageError(f"--format is '{form}', not known; choose from {', '.join(known)}")
+    if json and form not in ("text", "json"):
+        raise UsageError(f"--json is --format json, and --format {form} is given too; leave one of them out")
+    return "json" if json else form

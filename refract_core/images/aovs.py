@@ -50,6 +50,15 @@ def shape_of(name: str, height: int, width: int) -> tuple[int, ...]:
     return (height, width) if aov.scalar else (height, width, len(aov.channels))
 
 
+def channels_of(name: str, title: str) -> tuple[str, ...]:
+    """Channels of an AOV in an EXR file that calls it `title`. The picture itself is always R, G, B, A: viewers look
+    for these."""
+    aov = AOVS[name]
+    if name == "beauty" or title == name:
+        return aov.channels
+    return tuple(title if aov.scalar else f"{title}.{channel.rpartition('.')[2]}" for channel in aov.channels)
+
+
 def check_names(names: Sequence[str]) -> None:
     """Refuse AOV names that do not exist or come twice.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -38,7 +38,14 @@ class Frame:
                     f"plane '{name}' is {plane.dtype} of shape {plane.shape}; it must be float32 of shape {expected}"
                 )
 
-    def save(self, path: str | os.PathLike[str], *, aovs: Sequence[str] = (), color_correction: str = "sRGB") -> None:
+    def save(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        aovs: Sequence[str] = (),
+        color_correction: str = "sRGB",
+        names: Mapping[str, str] | None = None,
+    ) -> None:
         """Write the picture to `path`; its extension chooses the format.
 
         EXR holds scene-linear values of all chosen planes. PNG, JPEG, TIFF, WebP and AVIF hold one plane as 8 bits:
@@ -49,6 +56,7 @@ class Frame:
             path: file to write; a file of that name is replaced in one step, or not at all.
             aovs: names of the planes; empty means all of them for EXR and `beauty` for the other formats.
             color_correction: `sRGB`, `disabled` or `openColorIO` (the default view of $OCIO or the built-in config).
+            names: AOV -> what an .exr is to call it, where that is not its own name; the picture stays R, G, B, A.
 
         Raises:
             UsageError: an unknown extension, AOV or correction, or several AOVs for a format that holds one.
@@ -61,4 +69,4 @@ class Frame:
             if name not in self.planes:
                 raise UsageError(f"AOV '{name}' is not in this frame; it has {', '.join(self.planes)}")
         planes = {name: self.planes[name] for name in chosen}
-        write_frame(target, planes, self.metadata, color_correction=color_correction)
+        write_frame(target, planes, self.metadata, color_correction=color_correction, names=names)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..errors import ImageError, UsageError
 from ..files import check_place, write_whole
 from ..scene import F32, Texture
-from .aovs import AOVS, check_names, shape_of
+from .aovs import AOVS, channels_of, check_names, shape_of
 from .codec import (
     HALF_MAX,
     STRAIGHT_ALPHA,
@@ -169,7 +169,12 @@ def check_writable(path: str) -> None:
 
 
 def write_frame(
-    path: str, planes: Mapping[str, F32], metadata: Mapping[str, str | float], *, color_correction: str = "sRGB"
+    path: str,
+    planes: Mapping[str, F32],
+    metadata: Mapping[str, str | float],
+    *,
+    color_correction: str = "sRGB",
+    names: Mapping[str, str] | None = None,
 ) -> None:
     """Write planes to a file, in one step: the file appears whole, or not at all.
 
@@ -179,6 +184,7 @@ def write_frame(
         planes: AOV name -> float32, shapes as `aovs.shape_of`.
         metadata: attributes of the file, where the format has a place for them (EXR; PNG as text).
         color_correction: `sRGB`, `disabled` or `openColorIO`; colours in 8-bit files only.
+        names: AOV -> what its channels are called in an .exr, where that is another name; see `aovs.channels_of`.
 
     Raises:
         UsageError: see `check_output`.
@@ -193,7 +199,7 @@ def write_frame(
             raise ImageError(f"{path}: plane '{name}' has shape {plane.shape}, not {shape_of(name, height, width)}")
     pixels: NDArray[Any]
     if _extension(path) in LAYERED:
-        pixels, spec = _exr(planes, metadata, height, width)
+        pixels, spec = _exr(planes, metadata, height, width, names or {})
     else:
         ((name, plane),) = planes.items()
         pixels, spec = _eight_bit(path, name, plane, metadata, color_correction)
@@ -226,14 +232,20 @@ def _extension(path: str) -> str:
     return extension
 
 
-def _exr(planes: Mapping[str, F32], metadata: Mapping[str, str | float], height: int, width: int) -> tuple[F32, Any]:
+def _exr(
+    planes: Mapping[str, F32],
+    metadata: Mapping[str, str | float],
+    height: int,
+    width: int,
+    titles: Mapping[str, str],
+) -> tuple[F32, Any]:
     """Planes side by side as the channels of one EXR, and OpenImageIO's description of it."""
     names: list[str] = []
     formats: list[str] = []
     columns: list[F32] = []
     for name, plane in planes.items():
         aov = AOVS[name]
-        names += aov.channels
+        names += channels_of(name, titles.get(name, name))
         formats += ["half" if aov.color else "float"] * len(aov.channels)
         column = plane.reshape(height, width, len(aov.channels))
         # A colour beyond the largest half would become infinity, which no viewer averages well.

@@ -115,6 +115,11 @@ def attributes(api: str) -> Iterator[Sdf.AttributeSpec]:
     yield from sorted(specs, key=lambda spec: str(spec.name))
 
 
+def properties(api: str) -> list[str]:
+    """Names of the attributes and relationships that an API schema of ours defines."""
+    return sorted(str(spec.name) for spec in _definitions().GetPrimAtPath(f"/{api}").properties)
+
+
 def collection(prim: Usd.Prim, name: str) -> Collection:
     """A collection that is built into our schemas."""
     own = Usd.CollectionAPI(prim, name)

@@ -18,54 +18,72 @@ _IGNORED = (
     "dataWindowNDC",
     "materialBindingPurposes",
     "pixelAspectRatio",
-    "products",
     "renderingColorSpace",
 )
 
 
-def read_settings(stage: Usd.Stage, prim_path: str = "", notices: list[Notice] | None = None) -> dict[str, object]:
+def read_settings(
+    stage: Usd.Stage, prim_path: str = "", notices: list[Notice] | None = None, *, products: bool = False
+) -> dict[str, object]:
     """Fields of `RenderSettings` that a RenderSettings prim of the stage authors; what is not authored is not there.
 
     Args:
         prim_path: which prim; '' takes the one that the stage's metadata `renderSettingsPrimPath` names, if any
-        notices: grows by what is authored but not used
+        notices: grows by what is authored but not used, and by a path in the metadata that names nothing
+        products: the caller draws its products (`products.read_products`), so that they are used
 
     Raises:
-        StageError: there is no such prim, it is no RenderSettings, or one of its values is out of range.
+        StageError: `prim_path` names no RenderSettings, or one of its values is out of range.
     """
-    prim = _settings_prim(stage, prim_path)
+    prim = settings_prim(stage, prim_path, [] if notices is None else notices)
     if prim is None:
         return {}
-    found: dict[str, object] = {}
-    camera = [target for target in UsdRender.Settings(prim).GetCameraRel().GetForwardedTargets() if target.IsPrimPath()]
-    if camera:
-        found["camera"] = str(camera[0])
-    size = _authored(prim, "resolution")
-    if size is not None:
-        found["image_width"], found["image_height"] = (int(length) for length in size)
-        if min(size) < 1:
-            raise StageError(f"{prim.GetPath()}: resolution is {size}; both numbers must be 1 or more")
+    found = frame_of(prim)
     for name, field in (("includedPurposes", "purposes"), ("refract:tiers", "tiers")):
-        tokens = _authored(prim, name)
+        tokens = authored_value(prim, name)
         if tokens is not None:
             found[field] = tuple(str(token) for token in tokens)
     for name, field in (("refract:samples", "samples"), ("refract:maxLayers", "max_layers")):
-        number = _authored(prim, name)
+        number = authored_value(prim, name)
         if number is not None:
             found[field] = int(number)
     _check(prim, found)
     if notices is not None:
-        _tell_ignored(prim, notices)
+        tell_ignored(prim, notices)
+        if not products and UsdRender.Settings(prim).GetProductsRel().HasAuthoredTargets():
+            text = "products is authored but not used here; refract render writes them"
+            notices.append(Notice(str(prim.GetPath()), text))
     return found
 
 
-def _settings_prim(stage: Usd.Stage, prim_path: str) -> Usd.Prim | None:
-    """The prim asked for, else the one the stage names, if any. Raises StageError where it is none."""
-    where, path = FLAG, prim_path
-    if not prim_path:
-        where, path = "the stage's renderSettingsPrimPath", str(stage.GetMetadata("renderSettingsPrimPath") or "")
-        if not path:
-            return None
+def frame_of(prim: Usd.Prim) -> dict[str, object]:
+    """Camera and resolution that a RenderSettings or RenderProduct prim authors, as fields of `RenderSettings`.
+
+    Raises:
+        StageError: a resolution that no picture can have.
+    """
+    found: dict[str, object] = {}
+    camera = [target for target in UsdRender.SettingsBase(prim).GetCameraRel().GetForwardedTargets()
+              if target.IsPrimPath()]  # fmt: skip
+    if camera:
+        found["camera"] = str(camera[0])
+    size = authored_value(prim, "resolution")
+    if size is not None:
+        found["image_width"], found["image_height"] = (int(length) for length in size)
+        if min(size) < 1:
+            raise StageError(f"{prim.GetPath()}: resolution is {size}; both numbers must be 1 or more")
+    return found
+
+
+def settings_prim(stage: Usd.Stage, prim_path: str, notices: list[Notice]) -> Usd.Prim | None:
+    """The prim asked for, else the one the stage names, if any; None, with a notice, where the stage names none.
+
+    Raises:
+        StageError: `prim_path` names none.
+    """
+    path = prim_path or str(stage.GetMetadata("renderSettingsPrimPath") or "")
+    if not path:
+        return None
     absolute = path if path.startswith("/") else f"/{path}"
     prim = stage.GetPrimAtPath(absolute) if Sdf.Path.IsValidPathString(absolute) else None
     if prim and prim.IsA(UsdRender.Settings):
@@ -73,10 +91,14 @@ def _settings_prim(stage: Usd.Stage, prim_path: str) -> Usd.Prim | None:
     known = [str(other.GetPath()) for other in stage.Traverse() if other.IsA(UsdRender.Settings)]
     problem = f"is a {prim.GetTypeName() or 'prim without type'}, not a RenderSettings" if prim else "does not exist"
     choice = f"choose from {', '.join(known)}" if known else "the stage has no RenderSettings prim"
-    raise StageError(f"{where} names {path}, which {problem}; {choice}, or pass another path with {FLAG}")
+    if not prim_path:
+        text = f"renderSettingsPrimPath names {path}, which {problem}; the defaults are used ({choice}, with {FLAG})"
+        notices.append(Notice("/", text))
+        return None
+    raise StageError(f"{FLAG} names {path}, which {problem}; {choice}, or pass another path with {FLAG}")
 
 
-def _authored(prim: Usd.Prim, name: str) -> Any:
+def authored_value(prim: Usd.Prim, name: str) -> Any:
     """Value of an attribute where one is authored, else None. Settings hold for a whole render, not for a time."""
     attribute = prim.GetAttribute(name)
     return attribute.Get(Usd.TimeCode.EarliestTime()) if attribute and attribute.HasAuthoredValue() else None
@@ -89,7 +111,8 @@ def _check(prim: Usd.Prim, found: dict[str, object]) -> None:
         raise StageError(f"{prim.GetPath()}: {error}") from error
 
 
-def _tell_ignored(prim: Usd.Prim, notices: list[Notice]) -> None:
+def tell_ignored(prim: Usd.Prim, notices: list[Notice]) -> None:
+    """Name what a RenderSettings or RenderProduct authors and no picture here follows."""
     for name in _IGNORED:
         spec = prim.GetProperty(name)
         if spec and spec.IsAuthored() and _differs(prim, name):
@@ -98,5 +121,5 @@ def _tell_ignored(prim: Usd.Prim, notices: list[Notice]) -> None:
 
 def _differs(prim: Usd.Prim, name: str) -> bool:
     """Whether an authored attribute says anything but its fallback."""
-    value = _authored(prim, name)
+    value = authored_value(prim, name)
     return value is None or value != prim.GetPrimDefinition().GetAttributeFallbackValue(name)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-import re
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdLux
 
 from ..errors import StageError, UsageError
 from ..scene import F64, Mesh, Notice, Scene, Sphere, prim_of
+from ..settings import AS_IT_IS, Opening
 from .camera import choose_camera, read_cameras
 from .diagnostics import captured, words_of
 from .geometry.cages import FINENESS
@@ -30,6 +30,7 @@ from .geometry.ways import with_ways
 from .layers import mtlx
 from .lights.meshes import glowing
 from .lights.read import read_lights
+from .opening import mask_of, open_as
 from .ours import recognised
 from .preview import preview_stage
 from .probes.pictures import read_cubemap
@@ -42,18 +43,21 @@ Keep = Callable[[list[Placement], Tables], list[Placement]]
 
 FALLBACK_METRES_PER_UNIT = 0.01
 _WARNINGS = 20
-_KINDS = ("MaterialX ", "MDL ")
-"""How notices begin that are about a kind of node."""
-_VARIANT = re.compile(r"(?P<prim>(?:/\w+)*)\{(?P<set>[^{}=]{1,200})=(?P<name>[^{}=]{1,200})\}")
+_KINDS = ("MaterialX ", "MDL ", "elementSize ")
+"""How notices begin that are said once of all prims: about a kind of node, or a mistake of a whole exporter."""
 
 
-def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
+def open_stage(path: str | os.PathLike[str], opening: Opening = AS_IT_IS) -> Usd.Stage:
     """Opens a stage, with the newest content of its files; of a .mtlx file, balls of its materials.
 
     What composition left out is reported by `scene_from_stage`, as notices of the scene.
 
+    Args:
+        opening: session layer, variants and mask.
+
     Raises:
         StageError: the file is missing, unreadable, or not USD, or its instances stand for millions of prims.
+        UsageError: the opening asks for what is not there.
     """
     register()
     name = os.fspath(path)
@@ -69,7 +73,7 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
         raise StageError(f"{name}: cannot be read as .usd, .usda, .usdc or .usdz: {reason}")
     with captured() as heard:
         try:
-            stage = preview_stage(name) if mtlx.is_file(name) else Usd.Stage.Open(name)
+            stage = _opened(name, mask_of(opening))
         except Tf.ErrorException as error:
             heard.extend(words_of(part) for part in error.args)
             stage = None
@@ -82,36 +86,17 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
             if not layer.anonymous and not layer.dirty:
                 layer.Reload()
         mtlx.stand_in(stage)
+    open_as(stage, opening)
+    with captured():
         recognised(stage)
     refuse_too_many(stage)
     return stage
 
 
-def select_variants(stage: Usd.Stage, chosen: Iterable[str]) -> None:
-    """Choose variants over what the stage itself chooses, in its session layer.
-
-    Args:
-        chosen: as USD writes them, `/World/Car{paint=red}`; without a path, `{paint=red}` is of the default prim.
-
-    Raises:
-        UsageError: there is no such prim, set or variant.
-    """
-    for text in chosen:
-        found = _VARIANT.fullmatch(text)
-        if not found:
-            raise UsageError(f"variant '{text[:200]}' is not written as /Prim{{set=name}}")
-        prim = stage.GetPrimAtPath(found["prim"]) if found["prim"] else stage.GetDefaultPrim()
-        if not prim:
-            raise UsageError(f"variant '{text[:200]}': the stage has no such prim")
-        known = prim.GetVariantSets().GetNames()
-        if found["set"] not in known:
-            raise UsageError(f"variant '{text[:200]}': the prim has the sets {', '.join(known) or '(none)'}")
-        one = prim.GetVariantSet(found["set"])
-        if found["name"] not in one.GetVariantNames():
-            raise UsageError(f"variant '{text[:200]}': choose from {', '.join(one.GetVariantNames())}")
-        with Usd.EditContext(stage, stage.GetSessionLayer()), captured():
-            one.SetVariantSelection(found["name"])
-            mtlx.stand_in(stage)
+def _opened(name: str, mask: Usd.StagePopulationMask | None) -> Usd.Stage | None:
+    if mtlx.is_file(name):
+        return preview_stage(name)
+    return Usd.Stage.Open(name) if mask is None else Usd.Stage.OpenMasked(name, mask)
 
 
 def time_range(stage: Usd.Stage) -> tuple[float, float]:
@@ -178,7 +163,7 @@ def scene_from_stage(
 
 
 def _grouped(notices: dict[Notice, None]) -> list[Notice]:
-    """What is said of many nodes of one kind, said once."""
+    """What is said of many prims alike, said once."""
     paths: dict[str, list[str]] = {}
     for notice in notices:
         if notice.text.startswith(_KINDS):

@@ -16,5 +16,7 @@ __all__ = [
     "override",
     "render_files",
     "validate",
+    "validate_forms",
+    "validate_many",
     "warm",
 ]

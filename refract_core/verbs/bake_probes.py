@@ -20,6 +20,7 @@ from ..probes.digest import probe_digest
 from ..progress import Report
 from ..rendering.ready import capture_probes
 from ..scene import Cubemap, Probe, Scene
+from ..settings import AS_IT_IS, Opening
 from ..usd.layers.write import check_out, save
 from ..usd.probes.pictures import MADE, Baked, earlier, instanced, is_packed, layer_of, own_texture, read_asset
 from ..usd.stage import open_stage, scene_from_stage
@@ -57,6 +58,8 @@ class BakeOrder:
     skip_existing: bool = False
     """Leave every texture file that exists as it is, up to date or not."""
     overwrite: bool = False
+    opening: Opening = AS_IT_IS
+    """Session layer, variants and mask."""
 
 
 _STATE = "textures that were finished stay, and OUT is as it was"
@@ -101,7 +104,7 @@ def bake_probes(
     _check(order)
     check_out(order.stage, order.out, overwrite=order.overwrite, ours=MADE)
     report.progress(0.0, "reading the stage")
-    stage = open_stage(order.stage)
+    stage = open_stage(order.stage, order.opening)
     scene = scene_from_stage(stage)
     for notice in scene.notices:
         report.warning(notice.path, notice.text)
@@ -330,7 +333,7 @@ def _baked_elsewhere(
                order.samples, order.jobs, order.layout, _to_notes(record, task.probe))
         for number, (task, record) in enumerate(zip(tasks, records, strict=True))
     ]  # fmt: skip
-    sent = sent_stage(order.stage, scene.name)
+    sent = sent_stage(order.stage, scene.name, order.opening)
     results = spread(crew, _bake_one, errands, sent, stop=partial(stop_if, cancel, _STATE), waiting=patience(report))
     for done, (errand, (data, seconds)) in enumerate(results, 1):
         task = tasks[errand.number]

@@ -19,6 +19,7 @@ from ..images.pictures import write_map
 from ..models import Behind
 from ..progress import Report
 from ..scene import F32, F64, Notice
+from ..settings import AS_IT_IS, Opening
 from ..thickness.measure import Places, corner_places, measure, mended, middle_places, views
 from ..thickness.picture import OVERLAP, TILES, draw, is_tiled
 from ..usd.layers.write import check_out, is_over, overlay, save
@@ -51,6 +52,8 @@ class ThicknessOrder:
     """[texels] on a side of a picture in each object's own uv; 0 writes primvars."""
     jobs: int = 0
     overwrite: bool = False
+    opening: Opening = AS_IT_IS
+    """Session layer, variants and mask."""
 
     def __post_init__(self) -> None:
         if self.along not in ALONG:
@@ -116,7 +119,7 @@ def bake_thickness(order: ThicknessOrder, report: Report, cancel: Callable[[], b
     """
     check_out(order.stage, order.out, overwrite=order.overwrite, ours=MADE)
     report.progress(0.0, "reading the stage")
-    stage = open_stage(order.stage)
+    stage = open_stage(order.stage, order.opening)
     found = find_candidates(stage)
     chosen = select(found.candidates, order.only, lambda one: one.paths, "glass")
     for notice in found.notices:
@@ -149,17 +152,19 @@ def bake_over(
     along: str = "normal",
     jobs: int = 0,
     cancel: Callable[[], bool] = lambda: False,
+    opening: Opening = AS_IT_IS,
 ) -> tuple[Notice, ...]:
     """Author the measured thickness of prims in a layer over their stage, as primvars, in place of typed ones.
 
     Args:
         layer: an Sdf.Layer that holds the stage or has it as a sublayer, with the materials as they are to be.
         prims: paths; what of them is no glass, or not below the layer, is passed over.
+        opening: session layer, variants and mask of the stage.
 
     Returns:
         What was left as it was, and why.
     """
-    stage = stage_of(layer)
+    stage = stage_of(layer, opening)
     found = find_candidates(stage)
     wanted = set(prims)
     chosen = [candidate for candidate in found.candidates if wanted & set(candidate.paths)]

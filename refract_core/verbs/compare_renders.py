@@ -11,7 +11,7 @@ from ..errors import UsageError
 from ..models import Model
 from ..progress import Report
 from ..scene import Notice, Scene
-from ..settings import QUALITIES, RenderSettings
+from ..settings import AS_IT_IS, QUALITIES, Opening, RenderSettings
 from .compare_numbers import Contrast, Findings, Mask, find, glass_of
 from .compare_report import Account, Pictures, check_folder, write_account
 from .orders import check_range, stop_if
@@ -47,6 +47,8 @@ class CompareOrder:
     fail_under: float | None = None
     """[dB] of the glass, or of everything where there is none."""
     overwrite: bool = False
+    opening: Opening = AS_IT_IS
+    """Session layer, variants and mask."""
 
     def __post_init__(self) -> None:
         check_range("--reference-samples", self.reference_samples, SAMPLES)
@@ -104,7 +106,7 @@ def compare_stage(order: CompareOrder, report: Report, cancel: Callable[[], bool
     if order.write:
         check_out(order.stage, order.write, overwrite=order.overwrite, ours=MADE)
     report.progress(0.0, "reading the stage")
-    stage = open_stage(order.stage)
+    stage = open_stage(order.stage, order.opening)
     notices: list[Notice] = []
     settings = chosen_settings(read_settings(stage, order.settings_prim, notices), order.overrides)
     if order.suggest and settings.model:
@@ -116,7 +118,7 @@ def compare_stage(order: CompareOrder, report: Report, cancel: Callable[[], bool
     findings = find(drawn.contrast, drawn.frame.planes, _objects(drawn))
     suggestion: Suggestion | None = None
     if order.suggest:
-        suggestion = suggest(order.stage, order.write, drawn, read, cancel)
+        suggestion = suggest(order.stage, order.write, drawn, read, cancel, order.opening)
         notices += suggestion.notices
     for notice in dict.fromkeys(notices):
         report.warning(notice.path, notice.text)

@@ -13,6 +13,7 @@ from ..errors import StageError, UsageError
 from ..files import folder_beside, write_whole
 from ..models import BY_TOKEN, MODELS, SHEET, SOLID, Behind, Model
 from ..scene import Notice
+from ..settings import AS_IT_IS, Opening
 from ..thickness.fit import alike, together
 from ..usd.convert import gltf_stage
 from ..usd.convert.author import Addition, Work, add, begin
@@ -44,6 +45,8 @@ class ConvertOrder:
     to: str = ""
     """Standard surface to write back: preview, openpbr or gltf."""
     overwrite: bool = False
+    opening: Opening = AS_IT_IS
+    """Session layer, variants and mask."""
 
     def __post_init__(self) -> None:
         for flag, value, known in (
@@ -124,7 +127,8 @@ def convert(
         if order.thickness == "measured":
             from .bake_thickness import bake_over
 
-            left = bake_over(work.layer, [path for plan in plans for path in plan.sized], cancel=cancel)
+            prims = [path for plan in plans for path in plan.sized]
+            left = bake_over(work.layer, prims, cancel=cancel, opening=order.opening)
         _write_pictures(pictures)
         rows = [plan.row for plan in plans]
         if order.to:
@@ -142,7 +146,7 @@ def _look(order: ConvertOrder, pictures: str) -> tuple[Work, list[Glass], dict[s
         if not order.overwrite:
             refuse_existing(path for path, picture in content.items() if not _holds(path, picture))
         return work, found, content
-    work = begin(order.stage, flatten=order.flatten)
+    work = begin(order.stage, flatten=order.flatten, opening=order.opening)
     return work, find_glass(work.stage, work.time, work.unit), {}
 
 

@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from ..errors import RefractError, StageError, UsageError
 from ..progress import Report
 from ..scene import Notice, Scene
+from ..settings import AS_IT_IS, Opening
 from ..version import __version__
 
 if TYPE_CHECKING:
@@ -160,19 +161,27 @@ class Sent(NamedTuple):
     files: tuple[tuple[str, str], ...]
     """path and SHA-256 of everything it is made of"""
     version: str
+    opening: Opening = AS_IT_IS
 
 
-def sent_stage(path: str, name: str) -> Sent:
+def sent_stage(path: str, name: str, opening: Opening = AS_IT_IS) -> Sent:
     """What workers need to know of a stage.
 
     Args:
         path: of the stage, as a person wrote it.
         name: `Scene.name` of the stage.
+        opening: what is changed about it.
+
+    Raises:
+        UsageError: a session layer, which is no part of the stage, and would not be there.
     """
+    if opening.session_layer:
+        text = "is not sent to a cluster; write a layer over the stage that has it as a sublayer, and render that"
+        raise UsageError(f"--session-layer {opening.session_layer}: {text}")
     from ..usd.layers.assets import absolute, files_of
 
     stage = absolute(path)
-    return Sent(secrets.token_hex(8), stage, name, _hashed(files_of(stage)), __version__)
+    return Sent(secrets.token_hex(8), stage, name, _hashed(files_of(stage)), __version__, opening)
 
 
 def spread(
@@ -378,14 +387,14 @@ def _opened(sent: Sent, shared: bytes | None, here: Desk) -> _Opened | None:
     if sent.order in _open:
         return _open[sent.order]
     if _is_here(sent):
-        opened = _Opened(open_stage(sent.stage), sent.stage)
+        opened = _Opened(open_stage(sent.stage, sent.opening), sent.stage)
     elif shared is None:
         return None
     else:
         folder = tempfile.mkdtemp(prefix="refract-stage-", dir=here.folder)
         path = os.path.join(folder, f"{Path(sent.stage).stem}.usdz")
         Path(path).write_bytes(shared)
-        opened = _Opened(open_stage(path), path)
+        opened = _Opened(open_stage(path, sent.opening), path)
         weakref.finalize(opened, shutil.rmtree, folder, ignore_errors=True)
     _open[sent.order] = opened
     while len(_open) > _OPEN_STAGES:

@@ -35,6 +35,7 @@ import numpy as np
 
 from ..models import Behind
 from ..scene import F64, Camera, Param, Source
+from ..settings import AS_IT_IS, Opening
 from ..usd.materials.read import API
 from ..usd.rules.findings import WARNING, Finding
 from ..usd.rules.glass import Glass
@@ -56,13 +57,13 @@ _TESTS = 20_000_000
 Report = dict[str, Any]
 
 
-def inspect(stage: str, cancel: Callable[[], bool] = lambda: False) -> Report:
+def inspect(stage: str, cancel: Callable[[], bool] = lambda: False, opening: Opening = AS_IT_IS) -> Report:
     """Look through a stage; see the head of this module for what comes back.
 
     Raises:
         StageError: the stage cannot be opened.
     """
-    seen = overview_of(stage)
+    seen = overview_of(stage, opening)
     stop_if(cancel)
     scene = seen.scene
     shares = [[(probe.path, share(probe, piece)) for probe in scene.probes] for piece in seen.glass]
@@ -227,6 +228,11 @@ def _entries(origin: F64, direction: F64, piece: Glass) -> int:
 def to_json(report: Report) -> str:
     """See the head of this module."""
     return json.dumps(report, indent=2)
+
+
+def to_json_of_many(reports: Sequence[Report]) -> str:
+    """An array of them."""
+    return json.dumps(list(reports), indent=2)
 
 
 def to_text(report: Report) -> str:

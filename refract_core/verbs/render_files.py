@@ -10,12 +10,12 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ..errors import ImageError, StageError, UsageError
+from ..errors import ImageError, RefractError, StageError, UsageError
 from ..files import write_whole
 from ..probes.digest import stale_bakes
 from ..progress import Report
 from ..scene import Notice, Scene
-from ..settings import RenderSettings, named_settings
+from ..settings import AS_IT_IS, Opening, RenderSettings, named_settings
 from .executors import Bench, Crew, file_bytes, patience, sent_stage, spread
 from .orders import size_text, stop_if
 from .override import OverrideError, Overrides, check_overrides, override, override_notes
@@ -23,6 +23,8 @@ from .override import OverrideError, Overrides, check_overrides, override, overr
 if TYPE_CHECKING:
     from ..images.frame import Frame
     from ..rendering.session import Session
+    from ..usd.products import Product
+    from ..usd.time_codes import FrameJob
 
 COMPLEXITIES = ("low", "medium", "high", "veryhigh")
 _STATE = "no unfinished file was left"
@@ -34,8 +36,8 @@ class Order:
 
     stage: str
     """Path of the stage."""
-    out: str
-    """Path of the picture; with `frames`, a pattern with a ### group."""
+    out: str = ""
+    """Path of the picture; with `frames`, a pattern with a ### group. '' writes the products of the stage."""
     frames: str = ""
     """USD frame specs with commas between; '' is the stage's start."""
     overrides: Mapping[str, object] = field(default_factory=dict)
@@ -50,6 +52,8 @@ class Order:
     skip_existing: bool = False
     strict: bool = False
     """A picture that shows nothing of the stage is a failure, told when all are written."""
+    opening: Opening = AS_IT_IS
+    """Session layer, variants and mask."""
 
 
 def render_files(order: Order, report: Report, cancel: Callable[[], bool], crew: Crew | None = None) -> None:
@@ -72,15 +76,20 @@ def render_files(order: Order, report: Report, cancel: Callable[[], bool], crew:
         raise UsageError(f"--complexity is '{order.complexity}', not known; choose from {', '.join(COMPLEXITIES)}")
     with _flag():
         check_overrides(order.materials)
-    check_output(order.out, order.aovs, order.color_correction)
-    check_writable(order.out)
-    jobs = frame_jobs(order.frames, order.out)
-    for job in jobs:
-        if order.skip_existing and os.path.exists(job.path):
-            report.done(job.path, "exists, skipped")
-    jobs = [job for job in jobs if not (order.skip_existing and os.path.exists(job.path))]
-    if jobs:
-        _render_jobs(order, jobs, report, cancel, crew)
+    if order.out:
+        check_output(order.out, order.aovs, order.color_correction)
+        check_writable(order.out)
+        if not _left(order, frame_jobs(order.frames, order.out), report):
+            return
+    _render_jobs(order, report, cancel, crew)
+
+
+def _left(order: Order, jobs: Sequence[FrameJob], report: Report) -> list[FrameJob]:
+    """Without those whose pictures are to be left as they are; tells which."""
+    skipped = [job for job in jobs if order.skip_existing and os.path.exists(job.path)]
+    for job in skipped:
+        report.done(job.path, "exists, skipped")
+    return [job for job in jobs if job not in skipped]
 
 
 class _Shot(NamedTuple):
@@ -95,6 +104,8 @@ class _Shot(NamedTuple):
     complexity: str
     first: bool
     """Looks for stale probes as well, and for overrides that name nothing."""
+    names: Mapping[str, str]
+    """AOV -> what an .exr calls it"""
 
 
 class _Picture(NamedTuple):
@@ -108,11 +119,10 @@ class _Picture(NamedTuple):
     seconds: float
 
 
-def _render_jobs(
-    order: Order, jobs: Sequence[Any], report: Report, cancel: Callable[[], bool], crew: Crew | None
-) -> None:
+def _render_jobs(order: Order, report: Report, cancel: Callable[[], bool], crew: Crew | None) -> None:
     """Read what holds for all frames, and draw them here or elsewhere. Each notice is told once."""
     from ..rendering.picture import NOTHING_SEEN
+    from ..usd.products import read_products
     from ..usd.settings import read_settings
     from ..usd.stage import open_stage
 
@@ -128,18 +138,84 @@ def _render_jobs(
                 report.warning(notice.path, notice.text)
 
     report.progress(0.0, "reading the stage")
-    stage = open_stage(order.stage)
+    stage = open_stage(order.stage, order.opening)
     found: list[Notice] = []
-    settings = chosen_settings(read_settings(stage, order.settings_prim, found), order.overrides)
+    authored = read_settings(stage, order.settings_prim, found, products=True)
+    products = read_products(stage, order.settings_prim, found)
+    wanted = _wanted(order, stage, products, found)
     tell(found)
-    choices = settings, order.materials, order.aovs, order.color_correction, order.complexity
-    shots = [_Shot(job.time_code, job.path, *choices, job is jobs[0]) for job in jobs]
+    shots: list[_Shot] = []
+    for one in wanted:
+        settings = chosen_settings({**authored, **one.settings}, order.overrides)
+        choices = settings, order.materials, one.aovs, order.color_correction, order.complexity
+        jobs = one.jobs if order.out else _left(order, one.jobs, report)
+        shots += [_Shot(job.time_code, job.path, *choices, False, one.names) for job in jobs]
+    if not shots:
+        return
+    shots[0] = shots[0]._replace(first=True)
     if crew is None:
         _render_here(stage, shots, tell, report, cancel)
     else:
         _render_elsewhere(order, stage, shots, tell, report, cancel, crew)
     if order.strict and empty:
         raise StageError(f"{order.stage}: a picture shows nothing of the stage, which --strict does not let pass")
+
+
+class _Wanted(NamedTuple):
+    """One picture for each frame."""
+
+    jobs: Sequence[FrameJob]
+    settings: Mapping[str, object]
+    """What its product says over the stage's settings"""
+    aovs: tuple[str, ...]
+    names: Mapping[str, str]
+
+
+def _wanted(order: Order, stage: Any, products: Sequence[Product], notices: list[Notice]) -> list[_Wanted]:
+    """The picture of OUT, as the first product has it, or the picture of every product.
+
+    Raises:
+        UsageError: there is neither, or a product's file cannot be written.
+    """
+    from ..images.pictures import LAYERED, check_output, check_writable
+    from ..usd.time_codes import frame_jobs
+
+    if order.out:
+        jobs = [job for job in frame_jobs(order.frames, order.out)
+                if not (order.skip_existing and os.path.exists(job.path))]  # fmt: skip
+        if not products:
+            return [_Wanted(jobs, {}, order.aovs, {})]
+        if len(products) > 1:
+            text = f"only the first of {len(products)} RenderProducts is drawn, for OUT is one picture; leave OUT out"
+            notices.append(Notice(products[0].path, text))
+        first = products[0]
+        layered = os.path.splitext(order.out)[1].lower() in LAYERED
+        return [_Wanted(jobs, first.settings, order.aovs or (first.aovs if layered else ()), first.names)]
+    if not products:
+        raise UsageError("OUT is missing, and the stage's RenderSettings have no RenderProduct; name a picture")
+    found = []
+    for product in products:
+        aovs = order.aovs or product.aovs
+        try:
+            if os.path.splitext(product.file)[1].lower() not in LAYERED:
+                aovs = aovs[:1]
+            check_output(product.file, aovs, order.color_correction)
+            check_writable(product.file)
+            jobs = _frames(order, stage, product.file)
+        except RefractError as error:
+            raise UsageError(f"{product.path}: productName {error}") from error
+        found.append(_Wanted(jobs, product.settings, aovs, product.names))
+    return found
+
+
+def _frames(order: Order, stage: Any, file: str) -> list[FrameJob]:
+    """The jobs of a product, whose name may have a place for the frame though only one is drawn."""
+    from ..usd.stage import time_range
+    from ..usd.time_codes import FrameJob, frame_jobs, frame_path
+
+    if order.frames.strip() or "#" not in os.path.basename(file):
+        return frame_jobs(order.frames, file)
+    return [FrameJob(None, frame_path(file, time_range(stage)[0]))]
 
 
 Tell = Callable[[Sequence[Notice]], None]
@@ -155,7 +231,7 @@ def _render_here(stage: Any, shots: Sequence[_Shot], tell: Tell, report: Report,
         started = time.perf_counter()
         frame = _draw(read, shot, tell, _frame_progress(report, done, len(shots)), cancel, session)
         stop_if(cancel, _STATE)
-        frame.save(shot.path, aovs=shot.aovs, color_correction=shot.color_correction)
+        frame.save(shot.path, **_saving(shot))
         _say_done(report, shot, frame.width, frame.height, time.perf_counter() - started)
 
 
@@ -215,7 +291,7 @@ def _render_elsewhere(
         with _flag():
             override(scene_from_stage(stage, **_how(shots[0])), order.materials)
     root = stage.GetRootLayer()
-    sent = sent_stage(order.stage, root.realPath or root.identifier)
+    sent = sent_stage(order.stage, root.realPath or root.identifier, order.opening)
     report.progress(0.0, "waiting for the first frame")
     results = spread(crew, _picture, shots, sent, stop=partial(stop_if, cancel, _STATE), waiting=patience(report))
     for done, (shot, picture) in enumerate(results, 1):
@@ -231,8 +307,14 @@ def _picture(bench: Bench, shot: _Shot) -> _Picture:
     notices: dict[Notice, None] = {}
     tell = lambda some: notices.update(dict.fromkeys(some))  # noqa: E731
     frame = _draw(bench.read, shot, tell, _unheard, bench.cancel, bench.session())
-    data = file_bytes(lambda path: frame.save(path, aovs=shot.aovs, color_correction=shot.color_correction), shot.path)
+    data = file_bytes(lambda path: frame.save(path, **_saving(shot)), shot.path)
     return _Picture(data, frame.width, frame.height, tuple(notices), time.perf_counter() - started)
+
+
+def _saving(shot: _Shot) -> dict[str, Any]:
+    """How its file is written."""
+    how = {"aovs": shot.aovs, "color_correction": shot.color_correction}
+    return {**how, "names": shot.names} if shot.names else how
 
 
 def _unheard(_fraction: float, _stage: str) -> None:

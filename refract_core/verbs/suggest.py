@@ -15,6 +15,7 @@ import numpy as np
 
 from ..models import SHEET, Behind, Model
 from ..scene import Material, Mesh, Notice, Param, Scene, Source, Sphere
+from ..settings import AS_IT_IS, Opening
 from ..thickness.fit import alike, fit
 from ..usd.convert.author import Addition, add, begin
 from ..usd.convert.find import Glass, find_glass
@@ -67,7 +68,14 @@ class Suggestion:
             save(self.layer, self.written.file)
 
 
-def suggest(stage: str, write: str, drawn: Drawn, read: Read, cancel: Callable[[], bool]) -> Suggestion:
+def suggest(
+    stage: str,
+    write: str,
+    drawn: Drawn,
+    read: Read,
+    cancel: Callable[[], bool],
+    opening: Opening = AS_IT_IS,
+) -> Suggestion:
     """Try every model, with typed and measured thickness, on every glass material that is seen.
 
     Args:
@@ -75,15 +83,16 @@ def suggest(stage: str, write: str, drawn: Drawn, read: Read, cancel: Callable[[
         write: path of the layer that `Suggestion.save` is to write; '' makes none.
         drawn: the picture and its reference.
         read: makes scenes as the picture's was made.
+        opening: of the picture's stage.
 
     Raises:
         RefractError: whatever goes wrong while drawing.
     """
     scene, notices = drawn.scene, []
     names = list(dict.fromkeys(owner.material for owner in drawn.owners.every))
-    glass = glass_by_name(stage, names)
+    glass = glass_by_name(stage, names, opening)
     prims = [owner.path for owner in drawn.owners.every]
-    measured, left = measured_scene(stage, glass, prims, read, cancel)
+    measured, left = measured_scene(stage, glass, prims, read, cancel, opening)
     found: list[Trials] = []
     winners: dict[str, tuple[Candidate, Scene]] = {}
     for name in names:
@@ -105,8 +114,8 @@ def suggest(stage: str, write: str, drawn: Drawn, read: Read, cancel: Callable[[
         winners[name] = scenes[tried.index(trials.best)]
     if not write:
         return Suggestion(tuple(found), None, tuple(notices), None)
-    layer, changed_names, lost = authored(stage, scene, glass, winners)
-    frame = drawn.draw(read(stage_of(layer)), "as suggested")
+    layer, changed_names, lost = authored(stage, scene, glass, winners, opening)
+    frame = drawn.draw(read(stage_of(layer, opening)), "as suggested")
     score = drawn.against(frame).score(_counted(drawn))
     assert score is not None
     return Suggestion(tuple(found), Written(write, changed_names, score), (*notices, *lost), layer)
@@ -115,22 +124,29 @@ def suggest(stage: str, write: str, drawn: Drawn, read: Read, cancel: Callable[[
 # --- what there is --------------------------------------------------------------------------------------------------
 
 
-def glass_by_name(stage: str, names: list[str]) -> dict[str, Glass]:
+def glass_by_name(
+    stage: str, names: list[str], opening: Opening = AS_IT_IS
+) -> dict[str, Glass]:
     """What a layer can say about the scene's glass, by the name of the material."""
-    work = begin(stage, flatten=False)
+    work = begin(stage, flatten=False, opening=opening)
     every = {glass.path: glass for glass in find_glass(work.stage, work.time, work.unit)}
     return {name: every[name] for name in names if name in every}
 
 
 def measured_scene(
-    stage: str, glass: dict[str, Glass], prims: list[str], read: Read, cancel: Callable[[], bool] = lambda: False
+    stage: str,
+    glass: dict[str, Glass],
+    prims: list[str],
+    read: Read,
+    cancel: Callable[[], bool] = lambda: False,
+    opening: Opening = AS_IT_IS,
 ) -> tuple[Scene, dict[str, str]]:
     """The scene with every thickness measured that can be, and by path of a prim why one could not."""
     layer = overlay(stage, made=MADE)
     sized = next(model.token for model in Model if model.sized)  # of a model that fixes it none would be measured
     add(layer, [Addition(one.edit, True, {"refraction:model": sized}, {}) for one in glass.values() if one.edit])
-    left = bake_over(layer, prims, cancel=cancel)
-    return read(stage_of(layer)), {notice.path: notice.text for notice in left}
+    left = bake_over(layer, prims, cancel=cancel, opening=opening)
+    return read(stage_of(layer, opening)), {notice.path: notice.text for notice in left}
 
 
 def _things(scene: Scene, name: str) -> Iterator[Mesh | Sphere]:
@@ -290,7 +306,11 @@ def _counted(drawn: Drawn) -> Mask:
 
 
 def authored(
-    stage: str, scene: Scene, glass: dict[str, Glass], winners: dict[str, tuple[Candidate, Scene]]
+    stage: str,
+    scene: Scene,
+    glass: dict[str, Glass],
+    winners: dict[str, tuple[Candidate, Scene]],
+    opening: Opening = AS_IT_IS,
 ) -> tuple[Any, tuple[str, ...], list[Notice]]:
     """A layer over the stage with the winners in it, the materials it changes, and what could not be written."""
     layer, lost, changed = overlay(stage, made=MADE), [], []
@@ -309,7 +329,7 @@ def authored(
             prims += [thing.path for thing in _things(scene, name)]
     add(layer, additions)
     if prims:
-        lost += bake_over(layer, list(dict.fromkeys(prims)))
+        lost += bake_over(layer, list(dict.fromkeys(prims)), opening=opening)
     return layer, tuple(changed), lost
 
 

@@ -18,10 +18,11 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from ..settings import AS_IT_IS, Opening
 from ..usd.layers.write import check_out, overlay, save
 from ..usd.rules.findings import Finding, apply_repairs
 from ..usd.rules.stage import stage_findings, stock_findings
@@ -32,8 +33,12 @@ from .orders import stop_if
 FORMAT = "refract.validate/1"
 MADE = "validate --fix"
 SEVERITIES = ("error", "warning", "info")
+OURS = "refract."
+"""How the ids of our own rules begin."""
 _SHOWN = 10
-"""Findings of one rule that the plain text lists."""
+"""Findings of one rule of ours that the plain text lists."""
+_PLACES = 3
+"""Places of one of USD's validators that it names."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +49,8 @@ class ValidateOrder:
     fix: str = ""
     """Path of the layer to write; '' writes nothing."""
     overwrite: bool = False
+    opening: Opening = AS_IT_IS
+    """Session layer, variants and mask."""
 
 
 @dataclass(frozen=True)
@@ -70,21 +77,21 @@ def validate(order: ValidateOrder, cancel: Callable[[], bool] = lambda: False) -
     """
     if order.fix:
         check_out(order.stage, order.fix, overwrite=order.overwrite, ours=MADE)
-    found = _check(order.stage, cancel)
+    found = _check(order.stage, order.opening, cancel)
     if not order.fix:
         return Verdict(order.stage, found)
     layer = overlay(order.stage, made=MADE)
     apply_repairs(layer, (repair for finding in found for repair in finding.repairs))
     stop_if(cancel)
     save(layer, order.fix)
-    left = _check(order.fix, cancel)
+    left = _check(order.fix, order.opening, cancel)
     still = Counter(_key(finding) for finding in left)
     fixed = [finding for finding in found if finding.repairs and not still[_key(finding)]]
     return Verdict(order.stage, left, tuple(fixed), order.fix)
 
 
-def _check(stage: str, cancel: Callable[[], bool]) -> tuple[Finding, ...]:
-    opened = open_stage(stage)
+def _check(stage: str, opening: Opening, cancel: Callable[[], bool]) -> tuple[Finding, ...]:
+    opened = open_stage(stage, opening)
     found = stage_findings(opened)
     stop_if(cancel)
     found += stock_findings(opened)
@@ -118,10 +125,15 @@ def fix_of(finding: Finding, stage: str) -> str:
     return finding.fix.replace("STAGE", stage)
 
 
-def to_json(verdict: Verdict) -> str:
+def counts_of(findings: Iterable[Finding]) -> Counter[str]:
+    """How many there are of each severity."""
+    return Counter(finding.severity for finding in findings)
+
+
+def record_of(verdict: Verdict) -> dict[str, Any]:
     """See the head of this module."""
-    counts = Counter(finding.severity for finding in verdict.findings)
-    record = {
+    counts = counts_of(verdict.findings)
+    return {
         "format": FORMAT,
         "stage": verdict.stage,
         "engine": __version__,
@@ -130,20 +142,50 @@ def to_json(verdict: Verdict) -> str:
         "fixed": [finding_record(finding, verdict.stage) for finding in verdict.fixed],
         "findings": [finding_record(finding, verdict.fixed_in or verdict.stage) for finding in verdict.findings],
     }
-    return json.dumps(record, indent=2)
+
+
+def to_json(verdict: Verdict) -> str:
+    """See the head of this module."""
+    return json.dumps(record_of(verdict), indent=2)
 
 
 def to_text(verdict: Verdict) -> str:
-    """For a person."""
-    lines: list[str] = []
-    if verdict.fixed_in:
-        lines += [f"fixed    {finding.rule}  {finding.path}" for finding in verdict.fixed]
+    """For a person: our own verdict first, then USD's validators, a line each."""
     subject = verdict.fixed_in or verdict.stage
-    lines += list(_listed(verdict.findings, subject, fixing=not verdict.fixed_in))
-    counts = Counter(finding.severity for finding in verdict.findings)
-    said = ", ".join(f"{counts[severity]} {severity}{'' if counts[severity] == 1 else 's'}" for severity in SEVERITIES)
-    lines.append(f"{subject}: {said}" if verdict.findings else f"{subject}: nothing to complain about")
+    mine = [finding for finding in verdict.findings if finding.rule.startswith(OURS)]
+    others = [finding for finding in verdict.findings if not finding.rule.startswith(OURS)]
+    lines = [f"fixed    {finding.rule}  {finding.path}" for finding in verdict.fixed]
+    lines.append(f"{subject}: {_counted(mine) if mine else 'nothing to complain about'}")
+    lines += _listed(mine, subject, fixing=not verdict.fixed_in)
+    if others:
+        lines.append(f"USD's own validators: {_counted(others)}")
+        lines += _grouped(others)
     return "\n".join(lines)
+
+
+def summary(verdicts: Sequence[Verdict]) -> str:
+    """The last line about many stages."""
+    bad = sum(not verdict.passed for verdict in verdicts)
+    return f"{len(verdicts)} stages, {bad} of them with errors: " + _counted(
+        finding for verdict in verdicts for finding in verdict.findings
+    )
+
+
+def _counted(findings: Iterable[Finding]) -> str:
+    counts = counts_of(findings)
+    return ", ".join(f"{counts[severity]} {severity}{'' if counts[severity] == 1 else 's'}" for severity in SEVERITIES)
+
+
+def _grouped(findings: Iterable[Finding]) -> Iterator[str]:
+    """One line for each validator and severity: how often, the first places, and what it says of the first."""
+    groups: dict[tuple[str, str], list[Finding]] = {}
+    for finding in findings:
+        groups.setdefault((finding.severity, finding.rule), []).append(finding)
+    for (severity, rule), same in groups.items():
+        paths = list(dict.fromkeys(finding.path for finding in same))
+        where = ", ".join(paths[:_PLACES]) + (", ..." if len(paths) > _PLACES else "")
+        often = f"{len(same)} times, " if len(same) > 1 else ""
+        yield f"{severity:<8} {rule}  {often}{where}: {same[0].text}"
 
 
 def _listed(findings: Iterable[Finding], stage: str, *, fixing: bool) -> Iterator[str]:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from pxr import Gf, Sdf, Usd, UsdGeom
 
 from ...scene import Notice
+from ...settings import AS_IT_IS, Opening
 from ..diagnostics import captured
 from ..layers.assets import outer_of
 from ..layers.write import RECORD, apply_api, overlay
@@ -48,16 +49,17 @@ class Addition(NamedTuple):
     """Attribute -> what drives it, where no output of the stage can be connected to: nodes are written for it."""
 
 
-def begin(path: str, *, flatten: bool) -> Work:
+def begin(path: str, *, flatten: bool, opening: Opening = AS_IT_IS) -> Work:
     """Open a stage for conversion.
 
     Args:
         flatten: everything is composed into one layer, where instances can be reached too; else a layer on top.
+        opening: session layer, variants and mask. A flat layer holds what they make of the stage, one on top does not.
 
     Raises:
         StageError: the stage cannot be opened.
     """
-    stage = open_stage(path)
+    stage = open_stage(path, opening)
     notices = []
     if errors := stage.GetCompositionErrors():
         text = f"{len(errors)} parts of the stage cannot be composed, such as: {' '.join(str(errors[0]).split())}"

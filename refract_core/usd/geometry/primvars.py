@@ -13,6 +13,8 @@ from ...scene import F32, Notice
 from .triangulate import Index, turned_over
 
 CHANNELS = 4
+WHOLE = "elementSize is the number of all values, as some exporters write it, which would be one element; 1 is used"
+"""Said of a prim whose primvar has that mistake."""
 
 
 class Finer(Protocol):
@@ -138,8 +140,9 @@ def evaluate(primvar: UsdGeom.Primvar, time: Usd.TimeCode, topology: Topology | 
     picks: NDArray[np.int64] | None = None
     if primvar.IsIndexed():
         picks = np.asarray(primvar.GetIndices(time), np.int64)
-    if primvar.GetElementSize() != 1:
-        raise Unusable(f"its elementSize is {primvar.GetElementSize()}; only 1 can be used")
+    size = primvar.GetElementSize()
+    if size != 1 and size not in (len(values), len(values if picks is None else picks)):
+        raise Unusable(f"its elementSize is {size}; only 1 can be used")
     return to_corners(values, picks, primvar.GetInterpolation(), topology)
 
 
@@ -157,6 +160,8 @@ def read_primvar(
     except Unusable as reason:
         notices.append(Notice(str(prim.GetPath()), f"primvars:{name} is ignored: {reason}"))
         return None
+    if primvar.GetElementSize() != 1:
+        notices.append(Notice(str(prim.GetPath()), WHOLE))
     if primvar.GetInterpolation() == UsdGeom.Tokens.constant and (count := _authored(primvar, time)) > 1:
         text = f"primvars:{name} is constant, which takes one value, but has {count}; the first is used"
         notices.append(Notice(str(prim.GetPath()), text))

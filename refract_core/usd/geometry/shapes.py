@@ -24,7 +24,7 @@ from .cages import (
     steps_of,
     without_repeats,
 )
-from .primvars import Corners, Topology, Unusable, as_values, evaluate, to_corners
+from .primvars import WHOLE, Corners, Topology, Unusable, as_values, evaluate, to_corners
 from .refined import Fineness, surface
 from .traverse import CURVES
 from .triangulate import (
@@ -449,6 +449,8 @@ def _authored_normals(
     try:
         if primvar and primvar.HasValue():
             normals = evaluate(primvar, time, topology)
+            if primvar.GetElementSize() != 1:
+                notices.append(Notice(path, WHOLE))
         else:
             values = as_values(mesh.GetNormalsAttr().Get(time))
             if values is None or not len(values):

@@ -20,7 +20,7 @@ RECORD = "refract"
 """Key in customLayerData that says what made a layer (`made`) and over which stage (`stage`)."""
 
 # Composed from every layer of the stack, so that a copy in the stronger layer would apply it twice.
-_STAYS_BELOW = ("subLayers", "subLayerOffsets", "layerRelocates", "primOrder", "hasOwnedSubLayers", "sessionOwner")
+STAYS_BELOW = ("subLayers", "subLayerOffsets", "layerRelocates", "primOrder", "hasOwnedSubLayers", "sessionOwner")
 
 
 # --- before the work ---------------------------------------------------------------------------------------------
@@ -105,7 +105,7 @@ def overlay(stage: str, *, made: str) -> Sdf.Layer:
     layer = Sdf.Layer.CreateAnonymous("overlay.usda")
     layer.subLayerPaths.append(path)
     for key in below.pseudoRoot.ListInfoKeys():
-        if key not in _STAYS_BELOW:
+        if key not in STAYS_BELOW:
             layer.pseudoRoot.SetInfo(key, below.pseudoRoot.GetInfo(key))
     # The metadata's asset paths are relative to the stage, and the new layer will lie elsewhere.
     edit_asset_paths(layer, lambda asset: asset if asset == path else anchored(asset, below))

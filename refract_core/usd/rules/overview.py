@@ -12,7 +12,7 @@ from pxr import Usd, UsdGeom, UsdLux, UsdShade
 
 from ...errors import StageError
 from ...scene import Model, Scene
-from ...settings import RenderSettings
+from ...settings import AS_IT_IS, Opening, RenderSettings
 from ..geometry.parts import Bound, Tables, bind
 from ..geometry.traverse import Placement
 from ..materials.read import has_api, read_material
@@ -20,6 +20,7 @@ from ..settings import read_settings
 from ..stage import open_stage, scene_from_stage, stage_unit, time_range
 from .findings import Finding
 from .glass import Glass, glass_of
+from .names import name_findings
 from .probes import probe_findings, texture_state
 from .stage import UNREADABLE, glass_found, reader_findings, scenes_of
 from .values import fallback_findings, readable, value_findings
@@ -51,16 +52,16 @@ class Overview(NamedTuple):
     suspicious: list[Finding]
 
 
-def overview_of(path: str) -> Overview:
+def overview_of(path: str, opening: Opening = AS_IT_IS) -> Overview:
     """A stage at its first time code.
 
     Raises:
         StageError: it cannot be opened.
     """
-    stage = open_stage(path)
+    stage = open_stage(path, opening)
     values = value_findings(stage)
     other = readable(stage, values)
-    found = [*values, *fallback_findings(stage)]
+    found = [*values, *name_findings(stage), *fallback_findings(stage)]
     settings = _settings(other, found)
     scene = Scene((), (), metres_per_unit=stage_unit(stage, []), name=stage.GetRootLayer().identifier)
     drawn: list[Placement] = []

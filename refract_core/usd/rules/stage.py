@@ -14,6 +14,7 @@ from ..layers import mtlx
 from ..stage import scene_from_stage
 from .findings import ERROR, INFO, WARNING, Finding, Repair, Rule
 from .glass import FLAT_SPHERE, INSIDE_OUT, NO_UV, OPEN, SIZE, TRACED_OPEN, UNITS, Glass, glass_findings, glass_of
+from .names import ASTRAY, MISSPELT, STRANGE, name_findings
 from .probes import INSIDE, MISSING, OUTSIDE, STALE, UNBAKED, SceneAt, probe_findings
 from .values import FALLBACK, FINITE, IOR, RANGE, THIN, TOKEN, fallback_findings, readable, value_findings
 
@@ -23,8 +24,8 @@ READER = Rule("refract.reader", WARNING, "The renderer uses what is authored as 
 RULES = {
     rule.id: rule
     for rule in (
-        IOR, TOKEN, FINITE, RANGE, THIN, FALLBACK, OPEN, FLAT_SPHERE, TRACED_OPEN, SIZE, UNITS, INSIDE_OUT, NO_UV,
-        MISSING, UNBAKED, STALE, OUTSIDE, INSIDE, READER, UNREADABLE,
+        IOR, TOKEN, FINITE, RANGE, THIN, MISSPELT, STRANGE, ASTRAY, FALLBACK, OPEN, FLAT_SPHERE, TRACED_OPEN,
+        SIZE, UNITS, INSIDE_OUT, NO_UV, MISSING, UNBAKED, STALE, OUTSIDE, INSIDE, READER, UNREADABLE,
     )
 }  # fmt: skip
 
@@ -39,7 +40,7 @@ def stage_findings(stage: Usd.Stage) -> list[Finding]:
 
 def scene_findings(stage: Usd.Stage) -> list[Finding]:
     """What is found once the stage is read as a renderer does; see `value_findings` for what needs no reading."""
-    values, found = value_findings(stage), fallback_findings(stage)
+    values, found = value_findings(stage), [*name_findings(stage), *fallback_findings(stage)]
     other = readable(stage, values)
     try:
         scene = scene_from_stage(other)

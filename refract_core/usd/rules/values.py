@@ -224,7 +224,9 @@ def readable(stage: Usd.Stage, findings: Iterable[Finding]) -> Usd.Stage:
     session = Sdf.Layer.CreateAnonymous("known_tokens.usda")
     if stage.GetSessionLayer():
         session.subLayerPaths.append(stage.GetSessionLayer().identifier)
-    other = ours.recognised(Usd.Stage.Open(stage.GetRootLayer(), session, stage.GetPathResolverContext()))
+    other = Usd.Stage.Open(stage.GetRootLayer(), session, stage.GetPathResolverContext())
+    other.SetPopulationMask(stage.GetPopulationMask())
+    other = ours.recognised(other)
     other.SetEditTarget(session)
     for finding in wrong:
         prim = other.GetPrimAtPath(finding.path)

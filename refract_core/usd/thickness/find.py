@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from ...scene import F64, U32, Material, Model, Notice, Param, Texture
-from ...settings import PURPOSES
+from ...settings import AS_IT_IS, PURPOSES, Opening
 from ...world.solid import across, signed_volume
 from ..convert.find import editable, find_glass, original
 from ..diagnostics import captured
@@ -23,6 +23,7 @@ from ..geometry.skel import posed
 from ..geometry.traverse import CURVES, Placement, walk
 from ..geometry.triangulate import turned_over, weld
 from ..materials.read import THICKNESS_PRIMVAR, has_api, read_material
+from ..opening import open_as
 from ..ours import recognised
 from ..stage import stage_unit, time_range
 
@@ -143,10 +144,12 @@ def find_candidates(stage: Usd.Stage) -> Found:
     return Found(candidates, frozen, tuple(dict.fromkeys(notices)), time, in_pose)
 
 
-def stage_of(layer: Sdf.Layer) -> Usd.Stage:
+def stage_of(layer: Sdf.Layer, opening: Opening = AS_IT_IS) -> Usd.Stage:
     """The stage whose root a layer is; a door for those who know no USD."""
     with captured():  # whoever opened the stage below has been told
-        return recognised(Usd.Stage.Open(layer))
+        stage = Usd.Stage.Open(layer)
+        open_as(stage, opening)
+        return recognised(stage)
 
 
 def _merged(group: list[Candidate]) -> Candidate:
