@@ -49,9 +49,10 @@ class Cause(NamedTuple):
 CAUSES = (
     Cause("missing file", r"part of the stage is missing|cannot open|there is no such file|does not exist"),
     Cause("subdivision", r"subdivi|crease"),
-    Cause("curves", r"\b(Basis|Nurbs|Hermite)Curves|Nurbs(Patch|Curves)"),
-    Cause("points", r"\bPoints is not"),
-    Cause("volumes", r"\bVolume|FieldAsset|ParticleField|TetMesh"),
+    Cause("curves", r"\b(Basis|Nurbs|Hermite)Curves"),
+    Cause("patches", r"\bNurbsPatch"),
+    Cause("points", r"\bPoints\b.*\bis not"),
+    Cause("volumes", r"\b(Volume|ParticleField\w*|TetMesh) is not"),
     Cause("instances", r"instance|prototype"),
     Cause("MaterialX", r"^MaterialX |mtlx"),
     Cause("MDL", r"^MDL "),
@@ -92,7 +93,9 @@ def causes_of(notices: Iterable[str]) -> list[str]:
 
 def beside(stage: Path, stages: Sequence[Path]) -> Path | None:
     """A picture that somebody else made of a stage: of its name, or the only one beside the only stage."""
-    homes = [stage.parent, *(child for name in BESIDE for child in (stage.parent / name, stage.parent.parent / name))]
+    above = stage.parent.parent
+    around = [stage.parent] + [above] * (not any(other.parent == above for other in stages))
+    homes = [stage.parent, *(folder / name for name in BESIDE for folder in around)]
     found: list[tuple[int, str, Path]] = []
     for home in homes:
         if not home.is_dir():
