@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from .rendering.picture import render
     from .rendering.session import Session
     from .scene import Notice, Scene
-    from .settings import RenderSettings
+    from .settings import Opening, RenderSettings
     from .usd.stage import load_stage
     from .verbs.override import OverrideError, override
 
@@ -39,6 +39,7 @@ __all__ = [
     "Frame",
     "ImageError",
     "Notice",
+    "Opening",
     "OverrideError",
     "RefractError",
     "RenderSettings",
@@ -59,6 +60,7 @@ _ROOMS = {
     "Frame": "images.frame",
     "ImageError": "errors",
     "Notice": "scene",
+    "Opening": "settings",
     "OverrideError": "verbs.override",
     "RefractError": "errors",
     "RenderSettings": "settings",

@@ -277,3 +277,10 @@ def test_our_verdict_comes_first_and_each_of_usd_s_validators_takes_one_line() -
     theirs = lines[head + 1 :]
     assert theirs == ["error    usdX:A.C  /Q: other", "warning  usdX:A.B  500 times, /P0, /P1, /P2, ...: text 0"]
     assert not any("usdX" in line for line in lines[:head])
+
+
+def test_what_a_validator_lists_at_length_is_cut_between_words() -> None:
+    text = "duplicate " + " ".join(f"</Mesh/index_{n}>" for n in range(5000))
+    (line,) = to_text(Verdict("s.usda", (Finding("usdX:A.B", ERROR, "/P", text, ""),))).splitlines()[2:]
+    assert len(line) < 400
+    assert line.endswith("> ...")

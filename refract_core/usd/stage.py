@@ -112,6 +112,7 @@ def load_stage(
     purposes: tuple[str, ...] = ("default", "render"),
     camera: str = "",
     complexity: str = "low",
+    opening: Opening = AS_IT_IS,
 ) -> Scene:
     """Reads a stage at one time.
 
@@ -120,13 +121,14 @@ def load_stage(
         purposes: which of default, render, proxy and guide are drawn
         camera: prim path or name of the camera that `Scene.cameras` begins with; '' chooses one
         complexity: how fine subdivision surfaces are: low, medium, high or veryhigh
+        opening: session layer, variants and mask
 
     Raises:
         StageError: the stage cannot be opened or read.
-        UsageError: it has no such camera, or there is no such complexity.
+        UsageError: it has no such camera, there is no such complexity, or the opening asks for what is not there.
     """
     how: dict[str, Any] = {"time_code": time_code, "purposes": purposes, "camera": camera, "complexity": complexity}
-    return scene_from_stage(open_stage(path), **how)
+    return scene_from_stage(open_stage(path, opening), **how)
 
 
 def scene_from_stage(

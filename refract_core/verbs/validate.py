@@ -39,6 +39,8 @@ _SHOWN = 10
 """Findings of one rule of ours that the plain text lists."""
 _PLACES = 3
 """Places of one of USD's validators that it names."""
+_LETTERS = 300
+"""Of what one of them says."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,7 +187,14 @@ def _grouped(findings: Iterable[Finding]) -> Iterator[str]:
         paths = list(dict.fromkeys(finding.path for finding in same))
         where = ", ".join(paths[:_PLACES]) + (", ..." if len(paths) > _PLACES else "")
         often = f"{len(same)} times, " if len(same) > 1 else ""
-        yield f"{severity:<8} {rule}  {often}{where}: {same[0].text}"
+        yield f"{severity:<8} {rule}  {often}{where}: {_short(same[0].text)}"
+
+
+def _short(text: str) -> str:
+    """Cut between two words: some validators list every index of a mesh."""
+    if len(text) <= _LETTERS:
+        return text
+    return f"{text[: text.rfind(' ', 0, _LETTERS)]} ..." if " " in text[:_LETTERS] else text
 
 
 def _listed(findings: Iterable[Finding], stage: str, *, fixing: bool) -> Iterator[str]:
