@@ -56,8 +56,10 @@ CAUSES = (
     Cause("instances", r"instance|prototype"),
     Cause("MaterialX", r"^MaterialX |mtlx"),
     Cause("MDL", r"^MDL "),
-    Cause("shader of one renderer", r"shader .*(arnold|ri:|renderman|karma|not known)|no surface shader"),
-    Cause("texture", r"texture|picture|UDIM|colou?rSpace|wrap"),
+    Cause("shader of one renderer", r"surface shader .* is not one this renderer reads"),
+    Cause("shader node", r"^shader node "),
+    Cause("displacement", r"\bdisplacement\b"),
+    Cause("texture", r"texture|UDIM|colou?rSpace|has no file"),
     Cause("UDIM", r"UDIM"),
     Cause("light", r"\b\w*Light\w* is not|light.*(ignored|skipped|not drawn)|lightFilter|portal"),
     Cause("no light", r"no light"),
@@ -65,6 +67,11 @@ CAUSES = (
     Cause("depth of field", r"depth of field|fStop"),
     Cause("motion blur", r"shutter|motion"),
     Cause("draw mode", r"drawMode"),
+    Cause("subset", r"of its indices are ignored|elementType"),
+    Cause("value out of range", r"it is clamped|it must be"),
+    Cause("tint without a depth", r"transmission colou?r without a depth"),
+    Cause("binding without its schema", r"MaterialBindingAPI"),
+    Cause("not converted", r"not converted"),
     Cause("skinning", r"skin|bind pose|skeleton"),
     Cause("primvar", r"primvars:|normals is ignored"),
     Cause("bad geometry", r"left out|skipped:|not everything in"),
@@ -72,8 +79,8 @@ CAUSES = (
     Cause("empty", r"nothing is visible"),
     Cause("render settings", r"is authored but not used|renderSettingsPrimPath|RenderProduct|RenderVar"),
 )
-NO_MISTAKE = {"no camera", "no light", "empty"}
-"""Said of a stage that has none, which is drawn as well as it can be."""
+NO_MISTAKE = {"no camera", "no light", "empty", "binding without its schema"}
+"""Said of a stage that lacks something, and is drawn as well as it can be."""
 _CRASH, _LATE, _REFUSED, _UNSEEN = "crash", "too long", "refused", "nothing seen"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -43,6 +44,7 @@ Keep = Callable[[list[Placement], Tables], list[Placement]]
 
 FALLBACK_METRES_PER_UNIT = 0.01
 _WARNINGS = 20
+_LOOSE = re.compile(r"Found material bindings on prim at path \(([^)]*)\) but MaterialBindingAPI is not applied")
 _KINDS = ("MaterialX ", "MDL ", "elementSize ")
 """How notices begin that are said once of all prims: about a kind of node, or a mistake of a whole exporter."""
 
@@ -159,9 +161,19 @@ def scene_from_stage(
         except Tf.ErrorException as error:
             reason = words_of(error.args[0])
             raise StageError(f"{stage.GetRootLayer().identifier}: USD cannot read it: {reason}") from error
-    warnings = dict.fromkeys(" ".join(text.split()) for text in heard)
-    notices.extend(Notice(scene.name, f"USD says: {text}") for text in list(warnings)[:_WARNINGS])
+    notices.extend(_said(heard, scene.name))
     return replace(scene, notices=tuple(_grouped(dict.fromkeys(notices))))
+
+
+def _said(heard: list[str], name: str) -> Iterator[Notice]:
+    """What USD warned of while a stage was read, the same of many prims once."""
+    warnings = dict.fromkeys(" ".join(text.split()) for text in heard)
+    loose = {text: found[1] for text in warnings if (found := _LOOSE.search(text))}
+    if loose:
+        text = "bound to a material without MaterialBindingAPI, which USD may not follow one day; the binding is used"
+        yield Notice(next(iter(loose.values())), f"{text} ({some_of(list(dict.fromkeys(loose.values())))})")
+    for text in [text for text in warnings if text not in loose][:_WARNINGS]:
+        yield Notice(name, f"USD says: {text}")
 
 
 def _grouped(notices: dict[Notice, None]) -> list[Notice]:

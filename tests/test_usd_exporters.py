@@ -1,4 +1,4 @@
-"""elementSize of primvars: what exporters write when they mean 1, and what nobody can use."""
+"""What exporters get wrong all over a file: read as it was meant, and said once."""
 
 from __future__ import annotations
 
@@ -58,3 +58,18 @@ def test_another_size_is_still_of_no_use() -> None:
     scene = read(quad(3))
     assert "displayColor" not in scene.meshes[0].primvars
     assert "elementSize is 3" in texts(scene, "/Q")
+
+
+def test_bindings_without_their_schema_are_used_and_said_once() -> None:
+    """USD warns of each; files of a whole exporter have no schema anywhere."""
+    material = """def Material "M" {
+        token outputs:surface.connect = </M/S.outputs:surface>
+        def Shader "S" {
+            uniform token info:id = "UsdPreviewSurface"
+            color3f inputs:diffuseColor = (1, 0, 0)
+            token outputs:surface } }
+    """
+    scene = read(material + "".join(quad(1, extra="rel material:binding = </M>", name=f"Q{n}") for n in range(40)))
+    (said,) = [notice for notice in scene.notices if "MaterialBindingAPI" in notice.text]
+    assert (said.path, "40 prims" in said.text) == ("/Q0", True)
+    assert {scene.materials[number].name for mesh in scene.meshes for number in mesh.materials} == {"/M"}
