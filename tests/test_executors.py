@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 from refract_core.cli import app
 from refract_core.errors import Cancelled, RefractError, StageError, UsageError
 from refract_core.progress import Report
+from refract_core.settings import Opening
 from refract_core.verbs import executors
 from refract_core.verbs.bake_probes import BakeOrder, bake_probes
 from refract_core.verbs.executors import Bench, Crew, Sent, crew_at, patience, sent_stage, spread
@@ -157,6 +158,23 @@ def test_a_stage_that_changes_meanwhile_is_not_mixed(stage: Path, threads: Crew)
     (stage.parent / "light.usda").write_text(LIGHT.replace("0.9", "0.8"))
     with pytest.raises(StageError, match="was changed"):
         list(spread(threads, echo, [1], sent, stop=nothing, waiting=nothing))
+
+
+def paths(bench: Bench, _item: Any) -> list[str]:
+    scene = bench.read()
+    return sorted([mesh.path for mesh in scene.meshes] + [ball.path for ball in scene.spheres])
+
+
+def test_workers_open_a_stage_as_it_was_ordered(tmp_path: Path, threads: Crew) -> None:
+    stage = tmp_path / "two.usda"
+    stage.write_text('#usda 1.0\ndef Sphere "A" {\n}\ndef Sphere "B" {\n}\n')
+    sent = sent_stage(str(stage), "name", Opening(mask=("/B",)))
+    assert list(spread(threads, paths, [0], sent, stop=nothing, waiting=nothing)) == [(0, ["/B"])]
+
+
+def test_a_session_layer_is_not_sent(stage: Path) -> None:
+    with pytest.raises(UsageError, match=r"^--session-layer .*light\.usda: is not sent to a cluster"):
+        sent_stage(str(stage), "name", Opening(session_layer=str(stage.parent / "light.usda")))
 
 
 def test_without_workers_it_waits_and_says_so_once(stage: Path, threads: Crew) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures import TimeoutError as NotYet
@@ -58,7 +59,7 @@ def validate_each(
     waiting = list(stages)
     while waiting:
         # Not forked: USD has threads, and whatever is locked in one of them now would stay so.
-        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _leave_interrupts) as pool:
             try:
                 while waiting:
                     work = pool.submit(_verdict, waiting[0], opening)
@@ -71,7 +72,13 @@ def validate_each(
                             continue
                     del waiting[0]
             except BrokenProcessPool:
+                stop_if(cancel)
                 yield unreadable(waiting.pop(0), _DIED)
+
+
+def _leave_interrupts() -> None:
+    """To the process that waits: a terminal's Ctrl-C reaches both."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _verdict(stage: str, opening: Opening) -> Verdict:
