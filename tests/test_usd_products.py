@@ -210,6 +210,10 @@ def test_one_frame_fills_the_place_for_it_and_several_do_too(folder: Path) -> No
         ((), ["OUT is missing", "RenderProduct"]),
         ((product("A", 'token productName = "a.rat"'),), ["/Render/A", "productName", "a.rat", ".exr"]),
         ((product("A", 'token productName = "no/such/a.exr"'),), ["/Render/A", "no/such"]),
+        (
+            (product("A", 'token productName = "a.png"'), product("B", 'token productName = "./a.png"')),
+            ["/Render/A", "/Render/B", "productName"],
+        ),
     ],
 )
 def test_what_cannot_be_written_is_one_sentence(products: tuple[str, ...], words: list[str], folder: Path) -> None:

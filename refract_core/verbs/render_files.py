@@ -194,7 +194,11 @@ def _wanted(order: Order, stage: Any, products: Sequence[Product], notices: list
     if not products:
         raise UsageError("OUT is missing, and the stage's RenderSettings have no RenderProduct; name a picture")
     found = []
+    taken: dict[str, str] = {}
     for product in products:
+        other = taken.setdefault(os.path.abspath(product.file), product.path)
+        if other != product.path:
+            raise UsageError(f"{product.path}: productName {product.file} is that of {other}, too; change one of them")
         aovs = order.aovs or product.aovs
         try:
             if os.path.splitext(product.file)[1].lower() not in LAYERED:
