@@ -38,6 +38,9 @@ BESIDE = ("baseline", "baselines", "ref", "reference", "screenshot", "screenshot
 """Folders, and beginnings of file names, of pictures that show what a stage should look like."""
 
 
+_CRASH, _LATE, _REFUSED, _UNSEEN = "crash", "too long", "refused", "nothing seen"
+
+
 class Cause(NamedTuple):
     """Why a picture may not be right."""
 
@@ -77,11 +80,11 @@ CAUSES = (
     Cause("bad geometry", r"left out|skipped:|not everything in"),
     Cause("bad metadata", r"metersPerUnit|upAxis"),
     Cause("empty", r"nothing is visible"),
+    Cause(_UNSEEN, r"^no pixel of the picture shows anything"),
     Cause("render settings", r"is authored but not used|renderSettingsPrimPath|RenderProduct|RenderVar"),
 )
 NO_MISTAKE = {"no camera", "no light", "empty", "binding without its schema"}
 """Said of a stage that lacks something, and is drawn as well as it can be."""
-_CRASH, _LATE, _REFUSED, _UNSEEN = "crash", "too long", "refused", "nothing seen"
 
 
 def stages_in(folder: Path) -> list[Path]:
@@ -192,7 +195,7 @@ def row_of(stage: Path, name: str, out: Path, width: int, seconds: float) -> dic
         refused = said.startswith("refused: ")
         return row | {"causes": [_REFUSED if refused else _CRASH], "error": said.removeprefix("refused: ")}
     told = json.loads(ended.stdout.splitlines()[-1])
-    causes = causes_of(told.pop("texts")) + ([_UNSEEN] if told["seen"] == 0.0 else [])
+    causes = causes_of(told.pop("texts"))
     return {**row, **told, "picture": str(picture.relative_to(out)), "causes": causes}
 
 
@@ -269,7 +272,6 @@ def run(folder: Path, out: Path, *, width: int, seconds: float, jobs: int, keep:
         row = known.get(name) or row_of(stage, name, out, width, seconds)
         if name in known:
             row["causes"] = causes_of(text.partition(": ")[2] for text in row["notices"])
-            row["causes"] += [_UNSEEN] if row["seen"] == 0.0 else []
         other = beside(stage, stages)
         print(f"{row['seconds']:8.1f} s  {name}  {row['error'] or ', '.join(row['causes'])}", flush=True)
         return row | {"beside": str(other) if other else ""}
