@@ -15,8 +15,8 @@ measured beyond it. Every number in dB is the PSNR of sRGB pictures, clipped as 
 
 In the lit room matt surfaces do not light each other, in either program (`benchmarks.in_mitsuba`), and the truth is all
 that glass does to light: shadows, caustics, and the lamp seen through glass, which the engine shows in mirror pictures,
-but not straight through. A second truth, in which light goes straight through, tells which pixels caustics touch. "Mitsuba path" is
-Mitsuba as anybody would use it, with light between surfaces, too, against its own converged picture.
+but not straight through. A second truth, in which light goes straight through, tells which pixels caustics touch.
+"Mitsuba path" is Mitsuba as anybody would use it, with light between surfaces, too, against its own converged picture.
 
 Seconds are the median of the repeats, after a first time that is not counted, both programs by turns on all cores. Ours
 build the scene's tables and its hierarchy in every frame; Mitsuba's scene is loaded before, but it goes through its
