@@ -17,6 +17,24 @@ schemas.register()
 settings.register_profile("unhurried", parent=settings(), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("unhurried")
 
+_FOREIGN = {"test_docs", "test_attack", "test_executors", "test_ahead", "test_operate", "test_exits"}
+"""Rooms beside those of the service whose slow tests watch other processes: side by side they would be in each other's
+way."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what is quick; and keep what waits for processes, or for a wheel, to one worker (`--dist loadgroup`)."""
+    for item in items:
+        room = item.path.stem
+        if "site" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.draws)
+            item.add_marker(pytest.mark.xdist_group("processes"))
+        elif item.get_closest_marker("slow") and (room in _FOREIGN or room.startswith(("test_service", "test_page"))):
+            item.add_marker(pytest.mark.xdist_group("processes"))
+        if not (item.get_closest_marker("slow") or item.get_closest_marker("draws")):
+            item.add_marker(pytest.mark.quick)
+
+
 _ROOT = Path(__file__).parents[1]
 _ASSETS = Path(__file__).parents[2] / "shared" / "assets"
 

@@ -16,6 +16,8 @@ from refract_core.errors import RefractError
 from refract_core.scene import Light, LightKind
 from refract_core.verbs.compare import displayed, psnr
 
+pytestmark = pytest.mark.draws
+
 TINY = accuracy.Options(width=32, reference_samples=4, jobs=1)
 
 

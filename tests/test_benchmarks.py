@@ -12,6 +12,8 @@ import refract_core as rc
 from benchmarks import lobe, mutants, room, roughness, tiers
 from refract_core.scene import Mesh, Sphere
 
+pytestmark = pytest.mark.draws
+
 F64 = NDArray[np.float64]
 
 COUNT = 100_000

@@ -23,6 +23,8 @@ from refract_core.world import environment, textures
 from refract_core.world.lamps import pack_lights
 from refract_core.world.tables import pack_geometry, pack_materials, world_of
 
+pytestmark = pytest.mark.draws
+
 F64 = NDArray[np.float64]
 
 WHITE = material("/white", DIFFUSE=0.8, SPECULAR=0.0, IOR=1.0)

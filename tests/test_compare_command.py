@@ -30,6 +30,8 @@ from refract_core.verbs.compare_numbers import Contrast, Trial, Trials, correlat
 from refract_core.verbs.compare_report import FILES, FORMAT, heat
 from refract_core.verbs.owners import NOBODY, Owner, find_owners
 
+pytestmark = pytest.mark.draws
+
 SAMPLES = Path(__file__).parents[1] / "usd_samples" / "good"
 SMALL = ["--image-width", "48", "--samples", "1", "--reference-samples", "2", "--jobs", "1"]
 

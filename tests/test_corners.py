@@ -41,6 +41,8 @@ import refract_core as rc
 from refract_core.scene import Environment, LightKind, Material, Mesh, Model, Scene, Source, Sphere, Texture, Volume
 from refract_core.settings import named_settings
 
+pytestmark = pytest.mark.draws
+
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 

@@ -14,6 +14,8 @@ import refract_core as rc
 from refract_core.scene import LightKind, Mesh, Model, Scene
 from refract_core.settings import RenderSettings
 
+pytestmark = pytest.mark.draws
+
 F64 = NDArray[np.float64]
 
 

@@ -236,6 +236,7 @@ def test_looking_changes_no_file(tmp_path: Path) -> None:
 # --- many stages, and large ones ------------------------------------------------------------------------------------
 
 
+@pytest.mark.draws
 def test_real_stages_go_through_inspect_and_validate(assets: Path) -> None:
     stages = [path for path in sorted(assets.rglob("*")) if path.suffix in (".usd", ".usda", ".usdc", ".usdz")]
     refused: list[str] = []

@@ -17,6 +17,8 @@ from refract_core.rendering.picture import NOTHING_SEEN
 from refract_core.scene import Camera, Model, Scene, Sphere
 from refract_core.verbs.render_files import Order, render_files
 
+pytestmark = pytest.mark.draws
+
 FOCUS, RADIUS = 4.0, 0.1
 EYE = camera((0, 0, 4), (0, 0, 0), 0.25)
 LENS = replace(EYE, lens_radius=RADIUS, focus_distance=FOCUS)

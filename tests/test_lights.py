@@ -20,6 +20,8 @@ from refract_core.world.lights import irradiance_factor
 from refract_core.world.polygon import _angle_over_sine
 from refract_core.world.shaping import shape_matt
 
+pytestmark = pytest.mark.draws
+
 F64 = NDArray[np.float64]
 
 FLOOR = [(-50, 0, 50), (50, 0, 50), (50, 0, -50), (-50, 0, -50)]

@@ -24,6 +24,8 @@ from scenes import box, camera, glass, light, material, position_room, quad, sce
 import refract_core as rc
 from refract_core.scene import Channel, LightKind, Material, Model, Param, Probe, Scene, Source, Volume, Wrap
 
+pytestmark = pytest.mark.draws
+
 F32 = NDArray[np.float32]
 
 WIDTH, HEIGHT = 16, 12

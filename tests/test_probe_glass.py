@@ -35,6 +35,8 @@ from refract_core.rendering.work import Work
 from refract_core.scene import Camera, Material, Mesh, Model, Scene, Sphere
 from refract_core.settings import RenderSettings
 
+pytestmark = pytest.mark.draws
+
 F64 = NDArray[np.float64]
 SLAB = box("/slab", (2.5, 2.5, 0.2), 1, centre=(0, 0, -1.5))
 """Between the probe and the wall at -z."""

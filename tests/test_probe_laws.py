@@ -27,6 +27,8 @@ from scenes import (
 from refract_core.rendering.ready import capture_probes
 from refract_core.scene import Cubemap, LightKind, Model, Probe, Sphere, Volume
 
+pytestmark = pytest.mark.draws
+
 BALL = Sphere("/ball", (0.0, 0.0, 0.0), 0.7, 0)
 
 

@@ -11,6 +11,8 @@ from pxr import Usd, UsdGeom, UsdValidation
 import refract_core as rc
 from refract_core.images.pictures import read_texture
 
+pytestmark = pytest.mark.draws
+
 FOLDER = Path(__file__).parents[1] / "usd_samples" / "good"
 STAGES = sorted(FOLDER.glob("*.usda"))
 WEIGHTS = ("weight.screen", "weight.ray", "weight.probe", "weight.sky", "weight.none")

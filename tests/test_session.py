@@ -35,6 +35,8 @@ from refract_core.verbs.compare_renders import CompareOrder, compare_stage
 from refract_core.verbs.render_files import Order, render_files
 from refract_core.world import environment, textures
 
+pytestmark = pytest.mark.draws
+
 SAMPLES = Path(__file__).parents[1] / "usd_samples" / "good"
 SMALL = RenderSettings(image_width=24, image_height=16, samples=4, jobs=1, caustics=256)
 GLASS, BLOCK = 6, 7

@@ -436,6 +436,7 @@ def test_a_tint_is_left_after_the_mean_way_through_its_body(kind: str, way: floa
 REFUSED = {"framesPerSecond_-1.usda", "framesPerSecond_0.usda"}
 
 
+@pytest.mark.draws
 def test_every_real_stage_reads_or_is_refused_in_words(assets: Path) -> None:
     seen = 0
     for path in sorted(assets.rglob("*.usd*")):

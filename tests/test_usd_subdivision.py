@@ -896,6 +896,7 @@ def test_points_of_high_valence_and_polygons_of_many_sides() -> None:
 # --- as glass -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.draws
 def test_a_glass_cube_refracts_as_its_limit() -> None:
     """The picture of a cube that is subdivided is that of a fine mesh on the limit, with normals of its own making."""
     head = 'def DistantLight "L" { float inputs:intensity = 3 }\n'
