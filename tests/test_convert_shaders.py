@@ -157,9 +157,12 @@ def test_thin_absorbs_as_much_as_before(tmp_path: Path) -> None:
 
 
 def test_a_tint_is_reached_through_the_whole_body(tmp_path: Path) -> None:
-    row = run(stage(tmp_path, "mdl:", OMNI), tmp_path / "out.usda")["M"]
+    path, out = stage(tmp_path, "mdl:", OMNI), tmp_path / "out.usda"
+    row = run(path, out)["M"]
     assert row.model == "sphere"
-    assert row.distance == row.thickness == pytest.approx(2.0, rel=1e-5)
+    assert row.distance == pytest.approx(4.0 / 3.0, rel=1e-3)  # 4 V / S of a ball of 1, as where nothing is converted
+    before, after = (material(scene, "M").absorption_distance for scene in both(path, out))
+    assert after == pytest.approx(before, rel=1e-3)
 
 
 def test_a_tint_of_any_other_body_is_reached_over_the_mean_way_through_it(tmp_path: Path) -> None:

@@ -74,7 +74,8 @@ def convert_command(
     """Find the glass of a stage and describe it with RefractMaterialAPI.
 
     The model follows the shape a material is on: a closed convex ball is a sphere, a closed convex box a box, what is
-    open or hollow is thin, and everything else is traced. Materials that have RefractMaterialAPI are left alone.
+    open is thin, and everything else is traced, hollow bodies too. Materials that have RefractMaterialAPI are left
+    alone.
     """
     from ..verbs.convert import ConvertOrder, convert
 

@@ -1,11 +1,14 @@
 """Which refraction model suits a mesh: what its triangles enclose, and how near that is to a ball or a box.
 
     open                                   thin     a pane or a single-walled shell: light leaves where it entered
-    closed, one shell inside another,
-      or walls thin against the whole      thin     a bottle, a bulb, a drinking glass
     closed and convex, like a ball         sphere   thickness is the ball's diameter
     closed and convex, like a box          box      thickness is the box's smallest side
+    closed, one shell inside another,
+      or walls thin against the whole      traced   a bottle, a bulb, a drinking glass: whatever stands in it is seen
     anything else                          traced   the real mesh
+
+What is hollow has two walls, and each bends light. `thin` makes a pane of every one of them, and what the vessel holds
+is gone from the picture.
 
 Pure numpy on plain arrays, in whatever unit the points have.
 """
@@ -94,7 +97,7 @@ def _fit(points: F64, corners: Index) -> Fit:
     turned = [part for part, volume in zip(parts, volumes, strict=True) if volume * largest < 0.0]
     if any(_inside(points, part, outer) for part in turned):
         side = _smallest_side(points[np.unique(corners)])
-        return Fit(_WALL, side, True, False, "hollow: a shell inside a shell")
+        return Fit(_ANY, side, True, False, "hollow: a shell inside a shell")
     return together([_fit_part(points, part) for part in parts])
 
 
@@ -225,7 +228,7 @@ def _fit_part(points: F64, corners: Index) -> Fit:
     wall, share = _walls(part)
     sheet = 2.0 * signed_volume(part.points, part.corners) / float(part.areas.sum()) >= SHEET * wall
     if (wall <= SHEET_WALL * side and sheet) or (wall <= CAVITY_WALL * side and share >= CAVITY_SHARE):
-        return Fit(_WALL, side, True, False, f"hollow: walls of {_percent(wall / side)} of its smallest side")
+        return Fit(_ANY, side, True, False, f"hollow: walls of {_percent(wall / side)} of its smallest side")
     return Fit(_ANY, side, True, False, "closed, not convex")
 
 

@@ -259,8 +259,9 @@ def _absorption(
         return color, None  # type: ignore[return-value]
     if glass.distance is not None:
         return color, neat(glass.distance)  # type: ignore[return-value]
+    # As the renderer reads a shader's tint, so that the picture stays: after the mean way through a body.
     ways = [fit.way for use in uses for fit in use.fits if fit.way > 0.0]
-    distance = (thickness if model.sized else None) or glass.thickness or (neat(median(ways)) if ways else 1.0)
+    distance = glass.thickness or (neat(median(ways)) if ways else thickness or 1.0)
     notes.append(f"its colour tints a surface at any depth; here it is left after {distance:g} units")
     return color, distance  # type: ignore[return-value]
 

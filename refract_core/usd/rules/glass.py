@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...models import SHEET, Behind, Model, model_for
+from ...models import SHEET, SOLID, Behind, Model, model_for
 from ...scene import F64, Material, Mesh, Param, Scene, Source, Sphere
 from ...world.solid import encloses, is_convex
 from ..geometry.shapes import INWARDS, TURN
@@ -206,7 +206,7 @@ def _lengths(piece: Glass, unit: float) -> Iterator[Finding]:
         yield SIZE.broken(piece.path, text, measured, about)
     elif piece.model.behind is Behind.BALL and high < THINNER * piece.sides[0]:
         text = f"the thickness of {piece.row.name} is {high:.3g} m, but the body is {piece.sides[0]:.3g} m at least"
-        yield SIZE.broken(piece.path, text, f"{measured}; a hollow body wants the {SHEET.token} model", about)
+        yield SIZE.broken(piece.path, text, f"{measured}; a hollow body wants the {SOLID.token} model", about)
 
 
 def _no_uv(piece: Glass) -> Finding:
