@@ -19,7 +19,6 @@ import pytest
 from numpy.typing import NDArray
 
 from refract_core.errors import ImageError, SceneError, UsageError
-from refract_core.images import pictures as image
 from refract_core.images.aovs import AOVS, shape_of
 from refract_core.images.frame import Frame
 from refract_core.images.pictures import check_writable, read_texture, write_frame
@@ -126,7 +125,7 @@ def test_16_bit_srgb_is_decoded_but_for_alpha() -> None:
     np.testing.assert_allclose(texture.pixels[0, 0], [0.21404, 0.21404, 0.21404, 0.5], atol=2e-5)
 
 
-@pytest.mark.parametrize("color_space", image.COLOR_SPACES)
+@pytest.mark.parametrize("color_space", ["auto", "raw", "sRGB"])
 def test_radiance_files_are_linear_whatever_is_said(color_space: str) -> None:
     """RGBE of one pixel: mantissas 128, 64, 32 with exponent 129 are 1, 1/2 and 1/4 (Ward, "Real Pixels" 1991)."""
     data = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 1\n" + bytes([128, 64, 32, 129])
@@ -158,8 +157,8 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
 
 
 def test_an_unknown_colour_space_is_refused() -> None:
-    with pytest.raises(ImageError, match=r"lin_ap1.*auto, raw, sRGB"):
-        read_texture(png(random_bytes(3)), name="x", color_space="lin_ap1")
+    with pytest.raises(ImageError, match=r"LogC.*auto, raw, sRGB"):
+        read_texture(png(random_bytes(3)), name="x", color_space="LogC")
 
 
 def test_a_bomb_is_refused_by_its_header() -> None:

@@ -339,17 +339,13 @@ def test_an_eight_bit_dome_is_decoded_from_srgb(tmp_path: Path) -> None:
     assert found[0, 1] == pytest.approx([0.5029] * 3, abs=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("inputs", "said"),
-    [
-        ("asset inputs:texture:file = @none.exr@", "none.exr"),
-    ],
-)
-def test_a_dome_map_that_cannot_be_used_is_named_and_skipped(inputs: str, said: str) -> None:
-    _, environment, notices = read(f'def DomeLight "D"\n{{\n{inputs}\n}}')
-    assert environment is None
+def test_a_dome_map_that_is_missing_is_named_and_the_domes_own_colour_shines() -> None:
+    more = "asset inputs:texture:file = @none.exr@\ncolor3f inputs:color = (1, 0.5, 0.25)\nfloat inputs:intensity = 4"
+    _, environment, notices = read(f'def DomeLight "D"\n{{\n{more}\n}}')
+    assert environment is not None
+    assert environment.pixels.reshape(-1, 3) == pytest.approx(np.tile([4.0, 2.0, 1.0], (8, 1)))
     assert len(notices) == 1
-    assert said in notices[0].text
+    assert "none.exr" in notices[0].text
 
 
 def test_time_samples_are_taken_at_the_frame() -> None:

@@ -2,4 +2,4 @@
 but its records.
 """
 
-__all__ = ["aovs", "codec", "cubemaps", "frame", "layouts", "pictures", "srgb"]
+__all__ = ["aovs", "codec", "cubemaps", "frame", "layouts", "pictures", "spaces", "srgb"]

@@ -123,6 +123,25 @@ def read_channels(path: str, name: str) -> Channels:
         file.close()
 
 
+def read_size(path: str, name: str) -> tuple[int, int, bool]:
+    """Width and height of the display window of a file's first image, and whether it has 8 bits.
+
+    Raises:
+        ImageError: unreadable or too large.
+    """
+    import OpenImageIO as oiio
+
+    file = oiio.ImageInput.open(path)
+    if file is None:
+        raise ImageError(f"{name}: not a readable image: {reason(oiio.geterror(), path)}")
+    try:
+        spec = file.spec()
+        check_size(spec, name)
+        return spec.full_width, spec.full_height, spec.format.basetype in (oiio.UINT8, oiio.INT8)
+    finally:
+        file.close()
+
+
 def check_size(spec: Any, name: str) -> None:
     """Refuse, before its pixels are read, an image that is no flat picture or too large."""
     if spec.depth > 1 or spec.nchannels < 1:

@@ -21,11 +21,12 @@ from .codec import (
     named_file,
     read_channels,
     read_pixels,
+    read_size,
     reason,
 )
+from .spaces import AUTO, NAMES, RAW, SRGB, picture
 from .srgb import srgb_decode, srgb_encode
 
-COLOR_SPACES = ("auto", "raw", "sRGB")
 COLOR_CORRECTIONS = ("disabled", "sRGB", "openColorIO")
 LAYERED = (".exr",)
 EIGHT_BIT = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".avif")
@@ -42,27 +43,38 @@ def read_texture(source: str | bytes, *, name: str, color_space: str) -> Texture
 
     Missing channels are filled as UsdUVTexture does: one channel is grey, two are grey and alpha, and alpha is 1
     where the file has none. Values stay as the file has them, never premultiplied. 8-bit files stay uint8; 16-bit
-    integers become float32 in [0, 1], linear after `sRGB`; half and float files are linear whatever `color_space` says.
+    integers become float32 in [0, 1], and with them whatever has a space that bytes cannot be kept in. Half and float
+    files hold linear light, so of their colour space the primaries count alone.
 
     Args:
         source: a path, or the bytes of a file (from inside a package).
         name: what messages call it.
-        color_space: `raw`, `sRGB`, or `auto`: sRGB where the file has 8 bits and 3 or 4 channels, else raw.
+        color_space: one of `spaces.NAMES`. `auto` is sRGB where the file has 8 bits and 3 or 4 channels, else raw.
 
     Raises:
         ImageError: unreadable, damaged, too large, or an unknown colour space.
     """
-    if color_space not in COLOR_SPACES:
-        raise ImageError(f"{name}: colour space is '{color_space}'; choose from {', '.join(COLOR_SPACES)}")
+    if color_space not in NAMES:
+        raise ImageError(f"{name}: colour space is '{color_space}'; choose from {', '.join(NAMES)}")
     with named_file(source, name) as path:
         pixels, channels, integer, _ = read_pixels(path, name)
-    if pixels.dtype == np.uint8:
-        srgb = color_space == "sRGB" or (color_space == "auto" and channels >= 3)
-        return Texture(name, pixels, srgb)
-    if integer and color_space == "sRGB":
-        for row in pixels:  # row by row: of the whole picture, each step of the formula would be one more copy
-            row[:, :3] = srgb_decode(row[:, :3])
-    return Texture(name, pixels)
+    if color_space == AUTO:
+        color_space = SRGB if pixels.dtype == np.uint8 and channels >= 3 else RAW
+    if pixels.dtype == np.uint8 and color_space in (RAW, SRGB):
+        return Texture(name, pixels, color_space == SRGB)
+    if color_space == RAW or (color_space == SRGB and not integer):
+        return Texture(name, pixels)
+    return Texture(name, picture(pixels, color_space, encoded=integer))
+
+
+def texture_size(source: str | bytes, name: str) -> tuple[int, int, bool]:
+    """Width and height of an image file, and whether its colours have 8 bits, by its head alone.
+
+    Raises:
+        ImageError: unreadable, or too large.
+    """
+    with named_file(source, name) as path:
+        return read_size(path, name)
 
 
 def read_planes(path: str) -> dict[str, F32]:

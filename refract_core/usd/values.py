@@ -37,3 +37,17 @@ def listed(values: Iterable[float]) -> str:
 def neat(value: float) -> float:
     """Six digits: what float32 holds, and a person can read."""
     return float(f"{value:.6g}")
+
+
+_LONGEST = 80
+
+
+def short(path: str) -> str:
+    """A file's path as a message shows it: of a name longer than any file has, its two ends; of a URI that holds data,
+    what comes before them."""
+    if path.startswith("data:"):
+        return f"{path.partition(',')[0][:_LONGEST]},..."
+    folder, slash, name = path.rpartition("/")
+    if len(name) <= 2 * _LONGEST:
+        return path
+    return f"{folder}{slash}{name[:_LONGEST]}...{name[-_LONGEST // 4 :]}"

@@ -8,9 +8,11 @@ from typing import Any, NamedTuple
 
 from pxr import Gf, Sdf, UsdShade
 
+from ...images.spaces import AUTO, RAW, SRGB
 from ...scene import Channel, Source, Texture
 from ..materials.sources import is_constant, scaled
 from ..materials.textures import is_made, of_key
+from ..materials.udim import moved_out
 
 _TYPES = Sdf.ValueTypeNames
 _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
@@ -30,7 +32,10 @@ class Mapped(NamedTuple):
 
 def mapped(source: Source, textures: dict[str, Texture]) -> Mapped:
     """A source of a stage that was read with these textures."""
-    return Mapped(source, list(textures)[source.texture] if source.texture >= 0 else "")
+    if source.texture < 0:
+        return Mapped(source, "")
+    key = list(textures)[source.texture]
+    return Mapped(moved_out(source, textures[key]), key)
 
 
 def writable(what: Mapped) -> bool:
@@ -68,9 +73,12 @@ def author(layer: Sdf.Layer, home: str, name: str, what: Mapped, *, color: bool,
     node = nodes.make("texture", "UsdUVTexture_23" if mtlx else "UsdUVTexture")
     file = _set(node, "file", _TYPES.Asset, Sdf.AssetPath(path))
     if mtlx:
-        file.SetInfo("colorSpace", {"raw": "lin_rec709", "sRGB": "srgb_texture"}.get(space, "srgb_texture"))
-    else:
+        file.SetInfo("colorSpace", {RAW: "lin_rec709", SRGB: "srgb_texture", AUTO: "srgb_texture"}.get(space, space))
+    elif space in (AUTO, RAW, SRGB):  # all that the node has words for
         _set(node, "sourceColorSpace", _TYPES.Token, space)
+    else:
+        _set(node, "sourceColorSpace", _TYPES.Token, AUTO)
+        file.SetInfo("colorSpace", space)
     for axis, wrap in zip("ST", source.wrap, strict=True):
         word = "periodic" if mtlx and wrap.name == "REPEAT" else wrap.name.lower()
         _set(node, f"wrap{axis}", _TYPES.String if mtlx else _TYPES.Token, word)

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from xml.parsers import expat
 
 from ...errors import UsageError
+from ...images.spaces import AUTO, canonical, linear, told
 from ..values import finite, numbers
 
 LARGEST = 1 << 24
@@ -223,20 +224,8 @@ def _value(kind: str, text: str) -> Any:
     return found[0] if kind == "float" else found
 
 
-_GAMMAS = {"g22_rec709": 2.2, "g18_rec709": 1.8, "gamma22": 2.2, "gamma18": 1.8}
-_AP1 = ((1.70505, -0.62179, -0.08326), (-0.13026, 1.14080, -0.01055), (-0.02400, -0.12897, 1.15297))
-"""Rec. 709 from ACEScg (OpenColorIO, ACES config; D60 to D65 by Bradford)."""
-
-
 def _linear(color: tuple[float, ...], space: str, notices: dict[str, None]) -> tuple[float, ...]:
     """A colour of the file in linear Rec. 709."""
-    rgb = color[:3]
-    if space == "srgb_texture":
-        rgb = tuple(v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in rgb)
-    elif space in _GAMMAS:
-        rgb = tuple(max(v, 0.0) ** _GAMMAS[space] for v in rgb)
-    elif space in ("lin_ap1", "acescg", "lin_ap1_scene"):
-        rgb = tuple(sum(m * v for m, v in zip(row, rgb, strict=True)) for row in _AP1)
-    elif space not in ("", "lin_rec709", "lin_rec709_scene", "none", "raw"):
-        notices[f"MaterialX colour space '{space[:60]}' is not converted; its colours are read as linear"] = None
-    return (*rgb, *color[3:])
+    if not (known := canonical(space)):
+        notices[f"MaterialX {told(space)}; its colours are read as linear"] = None
+    return linear(color, known or AUTO)

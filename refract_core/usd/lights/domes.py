@@ -15,7 +15,7 @@ from pxr import Usd, UsdGeom, UsdLux
 
 from ...errors import ImageError
 from ...scene import F32, F64, Environment, Notice, Texture
-from ..materials.textures import read_texture, resolve_asset
+from ..materials.textures import light_texture, resolve_asset
 from .formats import FORMS, as_latlong, format_of
 
 _FORMATS = ("automatic", "latlong", *FORMS)
@@ -41,8 +41,8 @@ def read_dome(
     radiance: tuple[float, float, float],
     world_from_light: F64,
     notices: list[Notice],
-) -> Dome | None:
-    """Read DomeLight or DomeLight_1; None with a notice where its texture cannot be used.
+) -> Dome:
+    """Read DomeLight or DomeLight_1. One whose texture cannot be read keeps its colour, and a notice says so.
 
     Args:
         light: The light.
@@ -63,10 +63,11 @@ def read_dome(
                                         "automatic is used"))  # fmt: skip
             texture_format = "automatic"
         try:
-            pixels = linear(read_texture(file, "auto"))
+            pixels = linear(light_texture(asset, file))
         except ImageError as error:
-            notices.append(Notice(path, f"dome texture cannot be read: {error}; the light is skipped"))
-            return None
+            text = "the light has its own colour everywhere, as a dome without a texture"
+            notices.append(Notice(path, f"dome texture cannot be read: {error}; {text}"))
+    if pixels is not None:
         pixels = finite(pixels, path, notices, "dome texture")
         form = format_of(pixels, texture_format)
         if texture_format == "automatic" and form != "latlong":

@@ -105,8 +105,7 @@ def _read_light(
         dome = read_dome(
             light, context.time, radiance=shining, world_from_light=world_from_light, notices=context.notices
         )
-        if dome is not None:
-            domes.append(dome)
+        domes.append(dome)
         return
     row = ROWS[name]
     shape = row.read(context, prim, world_from_light)

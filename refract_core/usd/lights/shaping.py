@@ -11,7 +11,7 @@ from pxr import Usd, UsdLux
 
 from ...errors import ImageError
 from ...scene import F32, LightKind, Shadow, Shaping
-from ..materials.textures import file_of, read_texture, resolve_asset
+from ..materials.textures import file_of, light_texture, resolve_asset
 from .context import Context, note, number, value
 from .domes import finite, linear
 from .ies import parse, profile
@@ -66,7 +66,7 @@ def _profile(context: Context, prim: Usd.Prim) -> F32 | None:
         data = found if isinstance(found, bytes) else Path(found).read_bytes()
         ies = parse(data.decode("latin-1"))
     except (ImageError, ValueError, OSError) as error:
-        note(context, prim, f"inputs:shaping:ies:file {file} cannot be read: {error}; the light shines without it")
+        note(context, prim, f"inputs:shaping:ies:file cannot be read: {error}; the light shines without it")
         return None
     normalize = bool(value(context, prim, "inputs:shaping:ies:normalize", False))
     return profile(ies, scale if math.isfinite(scale) else 0.0, normalize)
@@ -85,7 +85,7 @@ def _picture(context: Context, prim: Usd.Prim) -> F32 | None:
     if not file:
         return None
     try:
-        pixels = linear(read_texture(file, "auto"))
+        pixels = linear(light_texture(asset, file))
     except ImageError as error:
         note(context, prim, f"light texture cannot be read: {error}; the light shines without it")
         return None

@@ -1,3 +1,3 @@
 """Surface shaders of every dialect, read as rows of the material table. Knows no geometry."""
 
-__all__ = ["nodes", "read", "sources", "surfaces", "textures", "vendors"]
+__all__ = ["nodes", "read", "sources", "surfaces", "textures", "udim", "vendors"]

@@ -28,7 +28,8 @@ def spread(context: Context, source: Source) -> Source:
         key = made(f"{source.channel.name} of {key}")
         if key not in context.textures:
             pixels: Any = np.repeat(plane[..., None], 4, axis=-1)
-            context.textures[key] = Texture(key, pixels, texture.srgb and source.channel is not Channel.A)
+            curved = texture.srgb and source.channel is not Channel.A
+            context.textures[key] = replace(texture, name=key, pixels=pixels, srgb=curved)
     c = source.channel
     return replace(
         source,

@@ -15,7 +15,7 @@ from pxr import UsdShade
 from ...scene import Channel, Param, Source
 from .coordinates import Uv
 from .folding import linear, product, spread
-from .nodes import picture_index, read_source
+from .nodes import in_tiles, picture_index, read_source
 from .sources import (
     Context,
     Value,
@@ -187,9 +187,9 @@ def _picture(context: Context, shader: UsdShade.Shader, name: str, *, color: boo
     if index < 0:
         return None
     uv = _uv(context, shader)
-    return Source(
+    return in_tiles(context, Source(
         value=constant(_WHITE).value, texture=index, uv_primvar=uv.primvar, uv_value=uv.value, uv_matrix=uv.matrix
-    )
+    ))  # fmt: skip
 
 
 def _uv(context: Context, shader: UsdShade.Shader) -> Uv:

@@ -13,8 +13,9 @@ from dataclasses import replace
 from pxr import Sdf, Usd, UsdShade
 
 from ...errors import ImageError
+from ...images.spaces import AUTO, canonical, linear, told
 from ...scene import Channel, Source, Wrap
-from ..values import finite, numbers
+from ..values import finite, numbers, short
 from . import folding
 from .coordinates import Matrix, Uv, compose, placed, read_uv
 from .sources import (
@@ -36,7 +37,8 @@ from .sources import (
     shown,
     single,
 )
-from .textures import COLOR_SPACES, read_texture, resolve_asset, texture_key
+from .textures import read_texture, resolve_asset, texture_key
+from .udim import LARGEST, Tiled, moved_in
 
 _CHANNELS = {"r": Channel.R, "g": Channel.G, "b": Channel.B, "a": Channel.A, "rgb": Channel.RGB}
 _WRAPS = {"black": Wrap.BLACK, "clamp": Wrap.CLAMP, "repeat": Wrap.REPEAT, "mirror": Wrap.MIRROR}
@@ -59,7 +61,8 @@ def read_source(context: Context, port: UsdShade.Input, default: Value, depth: i
         return constant(default)
     if not UsdShade.Output.IsOutput(attribute):
         size = len(default) if isinstance(default, tuple) else 1
-        return Source(value=four(read_numbers(context, port, (default,) if size == 1 else default)))  # type: ignore[arg-type]
+        value = four(read_numbers(context, port, (default,) if size == 1 else default))  # type: ignore[arg-type]
+        return Source(value=_in_rec709(context, attribute, value))
     key = str(attribute.GetPath()), isinstance(default, tuple)
     if key not in context.known:
         found = _node(context, UsdShade.Shader(attribute.GetPrim()), attribute.GetName(), default, depth)
@@ -120,11 +123,15 @@ def _loaded(context: Context, attribute: Usd.Attribute | None, color_space: str,
         except ImageError as error:
             note(context, f"texture cannot be read: {error}; its fallback colour is used", where)
             return -1
+        made = context.textures[key]
+        if isinstance(made, Tiled) and made.grid.step > 1:
+            text = f"the {len(made.grid.cells)} tiles of {short(path)} are read at 1/{made.grid.step} of their size"
+            note(context, f"{text}: together they come to more than {LARGEST >> 30} GB", where)
     return list(context.textures).index(key)
 
 
 def _color_space(context: Context, shader: UsdShade.Shader) -> str:
-    """The node's `sourceColorSpace`, else the `colorSpace` metadata of its file, as raw, sRGB or auto."""
+    """The node's `sourceColorSpace`, else the `colorSpace` metadata of its file."""
     chosen = str(read_constant(context, shader.GetInput("sourceColorSpace"), "auto"))
     attribute = producer(context, _file(shader))
     if chosen == "auto" and attribute is not None and attribute.HasColorSpace():
@@ -133,16 +140,25 @@ def _color_space(context: Context, shader: UsdShade.Shader) -> str:
 
 
 def _known_space(context: Context, chosen: str, where: Sdf.Path) -> str:
-    """raw, sRGB or auto, whatever a file calls it."""
-    if chosen in COLOR_SPACES or not chosen:
-        return chosen or "auto"
-    lowered = chosen.lower()
-    if lowered.startswith("srgb"):
-        return "sRGB"
-    if lowered in ("lin_rec709", "lin_rec709_scene", "linear", "data", "identity", "unknown"):
-        return "raw"
-    note(context, f"colour space '{chosen}' is not converted; it is read as 'auto'", where)
-    return "auto"
+    """One of `spaces.NAMES`, whatever a file calls it."""
+    if not (known := canonical(chosen)):
+        note(context, f"{told(chosen)}; it is read as '{AUTO}'", where)
+    return known or AUTO
+
+
+def _in_rec709(context: Context, attribute: Usd.Attribute, value: Four) -> Four:
+    """A colour that a stage gives in another space: by the attribute's metadata, or by ColorSpaceAPI of its prim or
+    of one above."""
+    if attribute.GetRoleName() != "Color":
+        return value
+    space = str(Usd.ColorSpaceAPI.ComputeColorSpaceName(attribute, None))
+    r, g, b = linear(value[:3], _known_space(context, space, attribute.GetPath()))
+    return r, g, b, value[3]
+
+
+def in_tiles(context: Context, source: Source) -> Source:
+    """The source of a picture, which may be made of tiles."""
+    return moved_in(source, list(context.textures.values())[source.texture])
 
 
 def _wrap(context: Context, shader: UsdShade.Shader, name: str, default: str, known: dict[str, Wrap]) -> Wrap:
@@ -178,7 +194,7 @@ def _uv_texture(context: Context, shader: UsdShade.Shader, output: str, default:
     uv = read_uv(context, shader.GetInput("st"), "", depth + 1)
     if not uv.primvar:
         note(context, f"inputs:st names no primvar; the texture is looked up at {uv.value} only", shader.GetPath())
-    source = Source(
+    source = in_tiles(context, Source(
         value=fallback,
         texture=texture,
         wrap=(
@@ -190,7 +206,7 @@ def _uv_texture(context: Context, shader: UsdShade.Shader, output: str, default:
         uv_primvar=uv.primvar,
         uv_value=uv.value,
         uv_matrix=uv.matrix,
-    )
+    ))  # fmt: skip
     return source if channel is Channel.RGB else single(source, channel)
 
 
@@ -221,7 +237,7 @@ def _looked_up(context: Context, shader: UsdShade.Shader, default: Value, uv: Uv
     if texture < 0:
         return Source(value=value)
     wrap = tuple(_wrap(context, shader, n, "periodic", _ADDRESS_MODES) for n in ("uaddressmode", "vaddressmode"))
-    return Source(
+    return in_tiles(context, Source(
         value=value,
         texture=texture,
         channel=channel,
@@ -229,7 +245,7 @@ def _looked_up(context: Context, shader: UsdShade.Shader, default: Value, uv: Uv
         uv_primvar=uv.primvar,
         uv_value=uv.value,
         uv_matrix=uv.matrix,
-    )
+    ))  # fmt: skip
 
 
 def _gltf_image(context: Context, shader: UsdShade.Shader, output: str, default: Value, depth: int) -> Source | None:
@@ -275,7 +291,7 @@ def _arnold_image(context: Context, shader: UsdShade.Shader, output: str, defaul
         read_source(context, shader.GetInput(word), (neutral,) * 3, depth + 1).value
         for word, neutral in (("multiply", 1.0), ("offset", 0.0))
     )
-    source = Source(texture=texture, uv_primvar=name, uv_matrix=(s, 0.0, x, 0.0, t, y))
+    source = in_tiles(context, Source(texture=texture, uv_primvar=name, uv_matrix=(s, 0.0, x, 0.0, t, y)))
     return single(scaled(source, factor, (*more[:3], 0.0)), channel) if channel < Channel.RGB else scaled(
         source, factor, (*more[:3], 0.0)
     )  # fmt: skip

@@ -11,6 +11,7 @@ from ...scene import Channel, Param, Source, Texture, Wrap
 from ..values import finite
 from .nodes import read_source
 from .sources import Context, Value, constant, is_constant, note, read_constant, read_number
+from .udim import Tiled
 
 GREY = 0.18
 """displayColor where none is authored, as UsdPreviewSurface's diffuseColor (Sdr definition of usd-core)."""
@@ -97,7 +98,7 @@ def clamped(context: Context, param: Param, source: Source, label: str) -> Sourc
 
 def lowest(source: Source, textures: dict[str, Texture]) -> float:
     """Smallest value a scalar source may take; -inf where that is not known."""
-    if source.primvar or (source.texture >= 0 and Wrap.BLACK in source.wrap):
+    if source.primvar or (source.texture >= 0 and Wrap.BLACK in source.wrap and not _tiled(source, textures)):
         return -math.inf
     if source.texture < 0:
         return source.value[0]
@@ -108,9 +109,15 @@ def _ends(source: Source, textures: dict[str, Texture]) -> list[float]:
     """What a scalar picture's smallest and largest texel give."""
     channel = Channel.R if source.channel is Channel.RGB else source.channel
     texture = list(textures.values())[source.texture]
-    plane = texture.pixels[..., channel]
+    # Between tiles and outside of them nothing is meant to be looked up.
+    parts = list(texture.parts()) if isinstance(texture, Tiled) else [texture.pixels]
     full = 255.0 if texture.pixels.dtype.kind == "u" else 1.0
-    return [float(end) / full * source.scale[channel] + source.bias[channel] for end in (plane.min(), plane.max())]
+    least, most = min(part[..., channel].min() for part in parts), max(part[..., channel].max() for part in parts)
+    return [float(end) / full * source.scale[channel] + source.bias[channel] for end in (least, most)]
+
+
+def _tiled(source: Source, textures: dict[str, Texture]) -> bool:
+    return isinstance(list(textures.values())[source.texture], Tiled)
 
 
 def highest(source: Source, textures: dict[str, Texture]) -> float:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
-from pxr import Ar, Sdf, Usd
+from pxr import Ar, Sdf, Usd, UsdShade
 
 from ...errors import ImageError
+from ...images.spaces import AUTO, NAMES, RAW, SRGB, canonical, told
 from ...scene import Texture
+from ..values import short
+from .udim import Size, is_tiled, read_tiles
 
-COLOR_SPACES = ("auto", "raw", "sRGB")
 _MADE = "made: "
+_URI = "data:"
 
 
 def resolve_asset(attribute: Usd.Attribute, time: Usd.TimeCode) -> str:
@@ -24,7 +28,13 @@ def resolve_asset(attribute: Usd.Attribute, time: Usd.TimeCode) -> str:
         return ""
     if asset.resolvedPath:
         return str(asset.resolvedPath)
+    if asset.path.startswith(_URI):
+        return str(asset.path)
     slashed = asset.path.replace("\\", "/")
+    if is_tiled(slashed):  # what the resolver finds is a tile
+        for spec in attribute.GetPropertyStack(time):
+            if tiles := str(UsdShade.UdimUtils.ResolveUdimPath(slashed, spec.layer)):
+                return tiles
     anchored = [str(spec.layer.ComputeAbsolutePath(slashed)) for spec in attribute.GetPropertyStack(time)]
     found = [path for path in anchored if Ar.GetResolver().Resolve(path)]
     return (found or anchored or [str(asset.path)])[0]
@@ -32,15 +42,15 @@ def resolve_asset(attribute: Usd.Attribute, time: Usd.TimeCode) -> str:
 
 def texture_key(path: str, color_space: str) -> str:
     """Name of the texture `read_texture(path, color_space)` gives: the same file may be read both ways."""
-    return path if color_space == "auto" else f"{path} ({color_space})"
+    return path if color_space == AUTO else f"{path} ({color_space})"
 
 
 def of_key(key: str) -> tuple[str, str]:
     """Path and colour space of a texture by its name: what `texture_key` was given."""
-    for space in COLOR_SPACES:
+    for space in NAMES:
         if key.endswith(f" ({space})"):
             return key.removesuffix(f" ({space})"), space
-    return key, "auto"
+    return key, AUTO
 
 
 def made(what: str) -> str:
@@ -54,23 +64,51 @@ def is_made(key: str) -> bool:
 
 
 def read_texture(path: str, color_space: str) -> Texture:
-    """Decode one image file.
+    """Decode one image file, or all the tiles of a name with <UDIM>: a `udim.Tiled`.
 
     Args:
         path: A file, or a file inside a package such as `a.usdz[tex/x.png]`.
-        color_space: `raw`, `sRGB`, or `auto` (8-bit files of three or four channels are sRGB, all else raw).
+        color_space: one of `spaces.NAMES`; `auto`: 8-bit files of three or four channels are sRGB, all else raw.
 
     Raises:
-        ImageError: The file is absent, is a set of UDIM tiles, or cannot be decoded.
+        ImageError: The file is absent, or cannot be decoded.
     """
     from ...images.pictures import read_texture as decode
 
-    if color_space not in COLOR_SPACES:
-        raise ImageError(f"{path}: colour space '{color_space}' is not one of {', '.join(COLOR_SPACES)}")
-    if "<UDIM>" in path:
-        raise ImageError(f"{path}: UDIM tiles are not read; name a single image file")
     name = texture_key(path, color_space)
+    if is_tiled(path) and not path.startswith(_URI):
+        texel = None if color_space in (AUTO, RAW, SRGB) else 16
+        return read_tiles(
+            path, name, _there, lambda tile: _size(tile, texel),
+            lambda tile: decode(file_of(tile), name=short(tile), color_space=color_space),
+        )  # fmt: skip
     return decode(file_of(path), name=name, color_space=color_space)
+
+
+def _there(path: str) -> bool:
+    """There is such a file, on disk or in its package."""
+    if Ar.IsPackageRelativePath(path):
+        return bool(Ar.GetResolver().Resolve(path))
+    return os.path.isfile(path)
+
+
+def _size(path: str, texel: int | None) -> Size:
+    from ...images.pictures import texture_size
+
+    width, height, is_small = texture_size(file_of(path), short(path))
+    return Size(width, height, texel or (4 if is_small else 16))
+
+
+def light_texture(attribute: Usd.Attribute, file: str) -> Texture:
+    """The picture of a light or dome, in the colour space of its attribute's metadata, else as its format says.
+
+    Raises:
+        ImageError: it cannot be decoded, or has a colour space that is not known.
+    """
+    space = str(attribute.GetColorSpace()) if attribute.HasColorSpace() else AUTO
+    if not (known := canonical(space)):
+        raise ImageError(f"{short(file)}: {told(space)}")
+    return read_texture(file, known)
 
 
 def file_of(path: str) -> str | bytes:
@@ -79,13 +117,16 @@ def file_of(path: str) -> str | bytes:
     Raises:
         ImageError: there is no such file.
     """
+    if path.startswith(_URI):
+        raise ImageError(f"{short(path)}: a picture inside of its name (a data: URI) is not read; save it as a file")
     if not Ar.IsPackageRelativePath(path):
-        if not Path(path).is_file():
-            raise ImageError(f"{path}: no such file; check the path, which is relative to the layer that names it")
+        if not os.path.isfile(path):  # False for a name longer than any file system allows
+            text = "no such file; check the path, which is relative to the layer that names it"
+            raise ImageError(f"{short(path)}: {text}")
         return path
     asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(path))
     if not asset:
         package, inner = Ar.SplitPackageRelativePathOuter(path)
         name = Path(package).name
-        raise ImageError(f"{path}: {name} holds no file '{inner}'; look into it with `usdzip -l {name}`")
+        raise ImageError(f"{short(path)}: {name} holds no file '{short(inner)}'; look into it with `usdzip -l {name}`")
     return bytes(asset.GetBuffer())
