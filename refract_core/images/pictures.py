@@ -127,14 +127,15 @@ def png_bytes(rgb: NDArray[np.uint8]) -> bytes:
     """A PNG file in memory.
 
     Args:
-        rgb: shape (H, W, 3), as shown.
+        rgb: shape (H, W, 3), as shown, or (H, W, 4) with straight alpha.
 
     Raises:
         ImageError: it cannot be encoded.
     """
     import OpenImageIO as oiio
 
-    spec = oiio.ImageSpec(rgb.shape[1], rgb.shape[0], 3, "uint8")
+    spec = oiio.ImageSpec(rgb.shape[1], rgb.shape[0], rgb.shape[2], "uint8")
+    spec.attribute(STRAIGHT_ALPHA, 1)
     spec.attribute("DateTime", "")
     spec.attribute("png:compressionLevel", _PNG_LEVEL)
     spec.attribute("png:filter", _PNG_SUB)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from ..errors import StageError, UsageError
@@ -18,15 +20,18 @@ from ..thickness.fit import alike, together
 from ..usd.convert import gltf_stage
 from ..usd.convert.author import Addition, Work, add, begin
 from ..usd.convert.find import Glass, find_glass
+from ..usd.convert.gltf_write import write_gltf
 from ..usd.convert.standard import write_surfaces
 from ..usd.convert.uses import Use, find_uses
-from ..usd.layers.write import check_out, save
+from ..usd.layers.write import EXTENSIONS, check_out, save
+from ..usd.thickness.find import stage_of
 from ..usd.values import neat
 from .orders import make_folder_of, refuse_existing, select, stop_if
 
 THICKNESS = ("typed", "measured")
-TARGETS = ("preview", "openpbr", "gltf")
+TARGETS = ("preview", "openpbr", "gltf", "mtlx")
 GLTF = (".glb", ".gltf")
+MTLX = ".mtlx"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +48,8 @@ class ConvertOrder:
     """Paths of materials, or of what holds them; * and ? stand for anything. Empty means all."""
     thickness: str = "typed"
     to: str = ""
-    """Standard surface to write back: preview, openpbr or gltf."""
+    """Standard surface to write back: preview, openpbr or gltf. Where `out` is a .glb, .gltf or .mtlx file, what it is
+    says its extension, and this may say gltf or mtlx again."""
     overwrite: bool = False
     opening: Opening = AS_IT_IS
     """Session layer, variants and mask."""
@@ -54,6 +60,17 @@ class ConvertOrder:
         ):  # fmt: skip
             if value and value not in known:
                 raise UsageError(f"{flag} is '{value}', which is not known; choose from {', '.join(known)}")
+        own = {"gltf": GLTF, "mtlx": (MTLX,)}.get(self.kind, ())
+        if self.kind and self.to not in ("", self.kind):
+            raise UsageError(f"--to {self.to} goes into a USD file, and {self.out} is none; leave --to out")
+        if self.to == "mtlx" and not own:
+            raise UsageError(f"--to mtlx writes a file of its own; end the name of OUT with {MTLX}")
+
+    @property
+    def kind(self) -> str:
+        """What OUT is where it is no USD file: gltf or mtlx."""
+        extension = os.path.splitext(self.out)[1].lower()
+        return "gltf" if extension in GLTF else "mtlx" if extension == MTLX else ""
 
 
 @dataclass(frozen=True)
@@ -111,9 +128,9 @@ def convert(
         StageError: the stage cannot be read, or OUT cannot be written.
         Cancelled: `cancel` said so; nothing was written.
     """
-    check_out(order.stage, order.out, overwrite=order.overwrite)
+    check_out(order.stage, order.out, overwrite=order.overwrite, extensions=(*GLTF, MTLX) if order.kind else EXTENSIONS)
     progress(0.0, "opening")
-    with folder_beside(order.out, "textures") as folder:
+    with _folder(order) as folder:
         work, found, pictures = _look(order, folder)
         chosen = select(found, order.only, lambda glass: (glass.path,), "glass")
         stop_if(cancel, "nothing was written")
@@ -131,12 +148,35 @@ def convert(
             left = bake_over(work.layer, prims, cancel=cancel, opening=order.opening)
         _write_pictures(pictures)
         rows = [plan.row for plan in plans]
+        if order.kind:
+            told, more = _export(order, work)
+            rows = [replace(row, notes=(*row.notes, *told.get(row.path, ()))) for row in rows]
+            return Converted(tuple(rows), (*work.notices, *left, *more))
         if order.to:
             within_reach = [row.path for row in rows if row.action != "skipped"]
             told = write_surfaces(work.layer, order.to, within_reach)
             rows = [replace(row, notes=(*row.notes, *told.get(row.path, ()))) for row in rows]
         save(work.layer, order.out)
     return Converted(tuple(rows), (*work.notices, *left))
+
+
+@contextmanager
+def _folder(order: ConvertOrder) -> Iterator[str]:
+    """Where pictures go that OUT refers to; a glTF file takes them in."""
+    if order.kind != "gltf":
+        with folder_beside(order.out, "textures") as beside:
+            yield beside
+        return
+    with TemporaryDirectory(prefix="refract-") as folder:
+        yield folder
+
+
+def _export(order: ConvertOrder, work: Work) -> tuple[dict[str, tuple[str, ...]], tuple[Notice, ...]]:
+    """Write OUT as what it is. What it does not say of single materials, and of all."""
+    stage = stage_of(work.layer)
+    written = write_gltf(stage, order.out)
+    write_whole(order.out, written.content, StageError)
+    return written.notes, written.notices
 
 
 def _look(order: ConvertOrder, pictures: str) -> tuple[Work, list[Glass], dict[str, bytes]]:
@@ -146,7 +186,7 @@ def _look(order: ConvertOrder, pictures: str) -> tuple[Work, list[Glass], dict[s
         if not order.overwrite:
             refuse_existing(path for path, picture in content.items() if not _holds(path, picture))
         return work, found, content
-    work = begin(order.stage, flatten=order.flatten, opening=order.opening)
+    work = begin(order.stage, flatten=order.flatten or bool(order.kind), opening=order.opening)
     return work, find_glass(work.stage, work.time, work.unit), {}
 
 

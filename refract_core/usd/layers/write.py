@@ -26,7 +26,9 @@ STAYS_BELOW = ("subLayers", "subLayerOffsets", "layerRelocates", "primOrder", "h
 # --- before the work ---------------------------------------------------------------------------------------------
 
 
-def check_out(stage: str, out: str, *, overwrite: bool, ours: str = "") -> None:
+def check_out(
+    stage: str, out: str, *, overwrite: bool, ours: str = "", extensions: tuple[str, ...] = EXTENSIONS
+) -> None:
     """Refuse, before any work, a place where no layer over `stage` can be written.
 
     Args:
@@ -34,12 +36,13 @@ def check_out(stage: str, out: str, *, overwrite: bool, ours: str = "") -> None:
         out: path of the layer to write.
         overwrite: an existing file may be replaced.
         ours: what makes the new layer; an existing one that the same thing made over the same stage may be replaced.
+        extensions: what OUT may end with.
 
     Raises:
         UsageError: the extension is unknown, OUT exists, or is the stage or one of the files it is made of.
         StageError: the folder is missing or cannot be written.
     """
-    if os.path.splitext(out)[1].lower() not in EXTENSIONS:
+    if os.path.splitext(out)[1].lower() not in extensions:
         raise UsageError(f"{out}: is not the name of a USD file; end it with one of {', '.join(EXTENSIONS)}")
     check_place(out, StageError)
     if not os.path.lexists(out):
