@@ -23,7 +23,8 @@ In = Annotated[
 Out = Annotated[
     str,
     typer.Argument(
-        metavar="OUT", help="The .usd, .usda, .usdc or .usdz file to write: a thin layer over IN, or all of it."
+        metavar="OUT", help="The .usd, .usda, .usdc or .usdz file to write: a thin layer over IN, or all of it. A .glb "
+        "or .gltf file has all that is drawn, with the KHR extensions of glass, a .mtlx file its materials as OpenPBR."
     ),
 ]
 Flatten = Annotated[
@@ -47,8 +48,9 @@ Thickness = Annotated[
 To = Annotated[
     str,
     typer.Option(
-        metavar="preview|openpbr|gltf",
-        help="Write the nearest standard surface back on each material too, for other renderers.",
+        metavar="preview|openpbr|gltf|mtlx",
+        help="Write the nearest standard surface back on each material too, for other renderers. What a .glb, .gltf or "
+        ".mtlx file is its name says: there gltf and mtlx may be left out.",
     ),
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace OUT if it exists. IN is never changed.")]

@@ -21,6 +21,7 @@ from ..usd.convert import gltf_stage
 from ..usd.convert.author import Addition, Work, add, begin
 from ..usd.convert.find import Glass, find_glass
 from ..usd.convert.gltf_write import write_gltf
+from ..usd.convert.mtlx_write import write_mtlx
 from ..usd.convert.standard import write_surfaces
 from ..usd.convert.uses import Use, find_uses
 from ..usd.layers.write import EXTENSIONS, check_out, save
@@ -149,7 +150,7 @@ def convert(
         _write_pictures(pictures)
         rows = [plan.row for plan in plans]
         if order.kind:
-            told, more = _export(order, work)
+            told, more = _export(order, work, folder)
             rows = [replace(row, notes=(*row.notes, *told.get(row.path, ()))) for row in rows]
             return Converted(tuple(rows), (*work.notices, *left, *more))
         if order.to:
@@ -171,12 +172,19 @@ def _folder(order: ConvertOrder) -> Iterator[str]:
         yield folder
 
 
-def _export(order: ConvertOrder, work: Work) -> tuple[dict[str, tuple[str, ...]], tuple[Notice, ...]]:
+def _export(
+    order: ConvertOrder, work: Work, folder: str
+) -> tuple[dict[str, tuple[str, ...]], tuple[Notice, ...]]:
     """Write OUT as what it is. What it does not say of single materials, and of all."""
     stage = stage_of(work.layer)
-    written = write_gltf(stage, order.out)
-    write_whole(order.out, written.content, StageError)
-    return written.notes, written.notices
+    if order.kind == "gltf":
+        written = write_gltf(stage, order.out)
+        write_whole(order.out, written.content, StageError)
+        return written.notes, written.notices
+    made = write_mtlx(stage, order.out, folder)
+    _write_pictures(made.pictures)
+    write_whole(order.out, made.content, StageError)
+    return made.notes, made.notices
 
 
 def _look(order: ConvertOrder, pictures: str) -> tuple[Work, list[Glass], dict[str, bytes]]:

@@ -67,14 +67,31 @@ def write_surfaces(layer: Sdf.Layer, target: str, paths: Iterable[str]) -> dict[
     return told
 
 
+def write_open_pbr(
+    layer: Sdf.Layer, material: UsdShade.Material, record: Material, textures: dict[str, Texture], unit: float
+) -> Iterable[str]:
+    """The OpenPBR surface of a material, opaque ones too, in a layer of its own.
+
+    Returns:
+        What cannot be said there; nothing where all of it is.
+    """
+    plain = record.model is Model.NONE
+    told = list(_write(layer, material, record, textures, _TARGETS["openpbr"], unit, plain=plain))
+    return [text for text in told if not text.endswith("is written on outputs:mtlx:surface")]
+
+
 def _write(
     layer: Sdf.Layer, material: UsdShade.Material, record: Material, textures: dict[str, Texture], target: _Target,
-    unit: float,
+    unit: float, *, plain: bool = False,
 ) -> Iterable[str]:  # fmt: skip
-    """One material's surface; tells what was done, or why nothing."""
+    """One material's surface; tells what was done, or why nothing.
+
+    Args:
+        plain: it is opaque, and written all the same.
+    """
     where = f"outputs:{target.context + ':' if target.context else ''}surface"
     place = editable(material.GetPrim())
-    if record.model is Model.NONE or place is None:
+    if (record.model is Model.NONE and not plain) or place is None:
         yield f"no {target.identifier} is written: " + (
             "it is out of reach" if place is None else "it refracts nothing"
         )
@@ -220,8 +237,14 @@ def _driven(record: Material, target: _Target, unit: float) -> dict[str, Source]
         source = record.inputs[param]
         if param in (Param.DIFFUSE, Param.METALLIC, Param.OCCLUSION) and clear:
             continue
-        if param is Param.OPACITY and target.context:
+        if param is Param.OPACITY and record.model is Model.NONE:
+            if not record.cutout:
+                continue
+            name = "geometry_opacity"
+        elif param is Param.OPACITY and target.context:
             source = scaled(source, -1.0, 1.0)
+        if param is Param.TRANSMITTANCE and record.model is Model.NONE:
+            continue
         if param is Param.THICKNESS:
             source = scaled(source, 1.0 / unit)
             if thin or source.texture < 0:  # a typed number yields to a primvar that no standard surface knows
@@ -272,6 +295,11 @@ def _preview(record: Material, unit: float) -> tuple[_Inputs, _Inputs]:
 def _open_pbr(record: Material, unit: float) -> tuple[_Inputs, _Inputs]:
     """What makes it glass in OpenPBR 1.1, and what else it may have."""
     thin = record.model.behind is Behind.SHEET
+    if record.model is Model.NONE:
+        body: _Inputs = {"base_color": _three(record.inputs[Param.DIFFUSE]), "specular_ior": _one(record, Param.IOR)}
+        if record.cutout:
+            body["geometry_opacity"] = _one(record, Param.OPACITY)
+        return body, _surface(record)
     glass: _Inputs = {
         "transmission_weight": neat(1.0 - _one(record, Param.OPACITY)),
         "specular_ior": _one(record, Param.IOR),
@@ -281,15 +309,19 @@ def _open_pbr(record: Material, unit: float) -> tuple[_Inputs, _Inputs]:
     }
     if record.abbe > 0.0:
         glass |= {"transmission_dispersion_scale": 1.0, "transmission_dispersion_abbe_number": neat(record.abbe)}
-    rest: _Inputs = {
-        "base_color": _base(record),
+    return glass, {"base_color": _base(record)} | _surface(record)
+
+
+def _surface(record: Material) -> _Inputs:
+    """What an OpenPBR surface has, let light through or not."""
+    found: _Inputs = {
         "base_metalness": _one(record, Param.METALLIC),
         "specular_roughness": _one(record, Param.ROUGHNESS),
     }
-    rest |= _body(record, "emission_color", "coat_weight", "coat_roughness")
-    if "emission_color" in rest or not is_constant(record.inputs[Param.EMISSIVE]):
-        rest["emission_luminance"] = 1.0
-    return glass, rest
+    found |= _body(record, "emission_color", "coat_weight", "coat_roughness")
+    if "emission_color" in found or not is_constant(record.inputs[Param.EMISSIVE]):
+        found["emission_luminance"] = 1.0
+    return found
 
 
 def _gltf(record: Material, unit: float) -> tuple[_Inputs, _Inputs]:
