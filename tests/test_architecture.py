@@ -25,6 +25,7 @@ ROOMS = {
     "OpenImageIO": ("refract_core.images",),
     "MaterialX": ("refract_core.usd.layers.mtlx_file",),
     "pygltflib": ("refract_core.usd.convert.gltf_file",),
+    "xatlas": ("refract_core.thickness.unwrap",),
     "flip_evaluator": ("refract_core.verbs.compare",),
     "distributed": ("refract_core.verbs.executors", "service.cluster", "service.cluster_worker"),
     "dask": ("refract_core.verbs.executors",),

@@ -125,7 +125,8 @@ Along = Annotated[
 Texture = Annotated[
     int,
     typer.Option(
-        metavar="N", help="Write pictures of N x N texels in each object's own uv, 16 to 8192, instead of primvars."
+        metavar="N", help="Write pictures of N x N texels in each object's own uv, 16 to 8192, instead of primvars. "
+        "With the extra unwrap, a mesh without uv gets one: primvars:refraction:st."
     ),
 ]
 

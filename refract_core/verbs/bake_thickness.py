@@ -22,10 +22,22 @@ from ..scene import F32, F64, Notice
 from ..settings import AS_IT_IS, Opening
 from ..thickness.measure import Places, corner_places, measure, mended, middle_places, views
 from ..thickness.picture import OVERLAP, TILES, draw, is_tiled
+from ..thickness.unwrap import EXTRA, unwrap
 from ..usd.layers.write import check_out, is_over, overlay, save
 from ..usd.stage import open_stage
 from ..usd.thickness.find import Body, Candidate, Coat, Found, find_candidates, read_body, stage_of
-from ..usd.thickness.write import MADE, Map, Values, lost_bindings, spread_values, write_maps, write_values
+from ..usd.thickness.write import (
+    MADE,
+    MADE_UV,
+    Map,
+    Values,
+    lost_bindings,
+    spread_values,
+    uv_of_corners,
+    write_maps,
+    write_uvs,
+    write_values,
+)
 from ..version import __version__
 from ..world.solid import areas
 from .orders import JOBS, check_range, file_names, make_folder_of, refuse_existing, select, stop_if
@@ -101,6 +113,8 @@ class Work:
     """Materials whose map comes before the primvars, by path"""
     maps: list[Map] = field(default_factory=list)
     pictures: dict[str, F32] = field(default_factory=dict)
+    uvs: dict[str, F64] = field(default_factory=dict)
+    """Texture coordinates that were made, by path: shape (N, 2), face-varying"""
 
 
 # --- the verb -------------------------------------------------------------------------------------------------------
@@ -136,6 +150,7 @@ def bake_thickness(order: ThicknessOrder, report: Report, cancel: Callable[[], b
         stop_if(cancel, _STATE)
         layer = overlay(order.stage, made=MADE)
         write_values(layer, stage, work.values, _unmapped(work))
+        write_uvs(layer, work.uvs)
         bound = write_maps(layer, stage, work.maps)
         _tell(report, found, work, lost_bindings(layer, bound))
         _write_pictures(work.pictures)
@@ -242,9 +257,18 @@ def _one(candidate: Candidate, body: Body, found: Found, how: How, files: dict[s
         work.coats.update({coat.material: coat for coat in candidate.coats if coat.mapped})
         work.rows.append(_row(candidate, flat, kind, notes))
         return ""
-    picture = _no_material(candidate) or _picture(candidate, body, how, notes)
+    if why := _no_material(candidate):
+        return why
+    made = _unwrapped(body, how, notes) if body.uv is None else None
+    if isinstance(made, str):
+        return made
+    if made is not None:
+        body, values = made
+    picture = _picture(candidate, body, how, notes)
     if isinstance(picture, str):
         return picture
+    if made is not None:
+        work.uvs[candidate.edit] = values
     file, most, mean = files[candidate.path], float(picture.max()), float(picture.mean())
     work.pictures[file] = picture / most
     for coat in candidate.coats:
@@ -325,10 +349,23 @@ def _no_material(candidate: Candidate) -> str:
     return ""
 
 
+def _unwrapped(body: Body, how: How, notes: list[str]) -> tuple[Body, F64] | str:
+    """A body with coordinates made for it, and what a face-varying primvar has of them; or why it has none."""
+    otherwise = "leave out --texture, which stores the thickness at the points"
+    try:
+        uv, charts = unwrap(body.points, body.triangles, how.texture)
+    except UsageError:
+        return f"it has no uv for a picture, and making some {EXTRA}; or {otherwise}"
+    values = uv_of_corners(body, uv)
+    if values is None:
+        return f"it has no uv for a picture, and its own faces cannot carry one that is made; {otherwise}"
+    notes.append(f"it had no uv: primvars:{MADE_UV} was made, {charts} chart{'s' if charts > 1 else ''}")
+    return replace(body, uv=uv, uv_name=MADE_UV), values
+
+
 def _picture(candidate: Candidate, body: Body, how: How, notes: list[str]) -> F32 | str:
     """Thickness by uv, shape (N, N)."""
-    if body.uv is None:
-        return "it has no uv for a picture; leave out --texture, which stores the thickness at the points"
+    assert body.uv is not None
     if not (np.isfinite(body.uv).all() and np.abs(body.uv - 0.5).max() <= TILES + 0.5):
         return f"its uv primvars:{body.uv_name} reaches more than {TILES:g} tiles away from 0 .. 1"
     rays = _views(candidate, how)

@@ -7,7 +7,7 @@ specialized (`UsdShade`'s base materials), and each object bound to its own.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +26,9 @@ INPUT = "inputs:refraction:thickness"
 _NAME = f"primvars:{THICKNESS_PRIMVAR}"
 _AGREE = 1.0e-3
 """Values at a point that differ less, against the largest of all, are one."""
+
+
+_SAME_UV = 1.0e-6
 
 
 @dataclass(frozen=True)
@@ -120,6 +123,36 @@ def write_values(layer: Sdf.Layer, stage: Usd.Stage, every: Iterable[Values], un
         for path in unmapped:
             spec = Sdf.CreatePrimInLayer(layer, path)
             _attribute(spec, INPUT, Sdf.ValueTypeNames.Float).connectionPathList.ClearEditsAndMakeExplicit()
+
+
+MADE_UV = "refraction:st"
+"""The primvar of coordinates that were made."""
+
+
+def uv_of_corners(body: Body, uv: F64) -> F64 | None:
+    """Values of a face-varying primvar, shape (N, 2); None where the prim's own faces cannot carry them.
+
+    Args:
+        uv: shape (T, 3, 2), at the triangle corners of the body.
+    """
+    assert body.topology is not None
+    if body.topology.refinement is not None:  # its corners are those of the limit surface
+        return None
+    at = uv[:, [0, 2, 1]] if body.mirrored else uv
+    of_corner = np.zeros((body.topology.corner_count, 2))
+    of_corner[body.topology.corners.ravel()] = at.reshape(-1, 2)
+    # A face of several triangles may lie in several charts.
+    return of_corner if np.abs(of_corner[body.topology.corners] - at).max() <= _SAME_UV else None
+
+
+def write_uvs(layer: Sdf.Layer, uvs: Mapping[str, F64]) -> None:
+    """Author made coordinates, by path of the prim."""
+    with Sdf.ChangeBlock():
+        for path, values in uvs.items():
+            spec = Sdf.CreatePrimInLayer(layer, path)
+            attribute = _fresh(spec, f"primvars:{MADE_UV}", Sdf.ValueTypeNames.TexCoord2fArray)
+            attribute.default = Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(values, np.float32))
+            attribute.SetInfo("interpolation", UsdGeom.Tokens.faceVarying)
 
 
 def _has(stage: Usd.Stage, path: str, name: str) -> bool:
