@@ -263,12 +263,12 @@ def _one(candidate: Candidate, body: Body, found: Found, how: How, files: dict[s
     if isinstance(made, str):
         return made
     if made is not None:
-        body, values = made
+        body, coordinates = made
     picture = _picture(candidate, body, how, notes)
     if isinstance(picture, str):
         return picture
     if made is not None:
-        work.uvs[candidate.edit] = values
+        work.uvs[candidate.edit] = coordinates
     file, most, mean = files[candidate.path], float(picture.max()), float(picture.mean())
     work.pictures[file] = picture / most
     for coat in candidate.coats:
