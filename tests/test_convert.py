@@ -229,8 +229,10 @@ def test_model_overrides_the_shape(tmp_path: Path) -> None:
 
 
 def test_shapes_of_different_size_get_their_own_thickness(tmp_path: Path) -> None:
-    scaled = ("double3 xformOp:scale = (3, 3, 3)", 'uniform token[] xformOpOrder = ["xformOp:scale"]')
-    prims = [ball("A", "Glass", 1.0), ball("B", "Glass", 0.5), ball("C", "Glass", 0.5, *scaled)]
+    order = 'uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:scale"]'
+    small = ("double3 xformOp:translate = (4, 0, 0)", "double3 xformOp:scale = (1, 1, 1)", order)
+    scaled = ("double3 xformOp:translate = (8, 0, 0)", "double3 xformOp:scale = (3, 3, 3)", order)
+    prims = [ball("A", "Glass", 1.0), ball("B", "Glass", 0.5, *small), ball("C", "Glass", 0.5, *scaled)]
     path, out = stage(tmp_path, [glass("Glass")], prims, unit=0.01), tmp_path / "out.usda"
     row = run(path, out)["Glass"]
     assert row.model == "sphere"

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scenes import draw, shell
+from scenes import draw, globe, shell
 from test_convert import HEAD, block, run
 from test_convert_fit import TUMBLER, revolved
 
@@ -85,6 +85,31 @@ def test_what_stands_in_a_two_walled_vessel_is_seen_as_before(tmp_path: Path, ki
     np.testing.assert_allclose(after, before, atol=2e-3)
     middle = after[22:26, 22:26]
     assert middle[..., 0].min() > 2.0 * middle[..., 1].max()  # the candle, through both walls
+
+
+@pytest.mark.parametrize("walls", ["one prim for each", "none: a solid ball"])
+def test_what_a_ball_holds_is_seen_as_before(tmp_path: Path, walls: str) -> None:
+    """Each prim is a ball by itself, and a ball's closed form looks straight out of its far side."""
+    outer, inner = (globe(f"/{radius}", radius, 0, 24) for radius in (1.0, 0.8))
+    parts = [mesh("Outer", outer.points, outer.triangles)]
+    if walls != "none: a solid ball":
+        parts.append(mesh("Inner", inner.points, inner.triangles, 'uniform token orientation = "leftHanded"'))
+    path = stage(tmp_path, looks(AMBER), *parts, ball("Lit", 0.3, "Candle"))
+    out = tmp_path / "out.usda"
+    assert "holds" in run(path, out)["Glass"].why
+    before, after = pictures(path, tmp_path / "again.usda")
+    np.testing.assert_allclose(after, before, atol=2e-3)
+    middle = after[22:26, 22:26]
+    assert middle[..., 0].min() > 1.5 * middle[..., 1].max()
+
+
+def test_what_stands_beside_a_ball_is_not_in_it(tmp_path: Path) -> None:
+    """Within its bounds, at a corner of them."""
+    one = globe("/one", 1.0, 0, 24)
+    speck = block('def Sphere "Speck"', "double radius = 0.05", "double3 xformOp:translate = (0.9, 0.9, 0.9)",
+                  'uniform token[] xformOpOrder = ["xformOp:translate"]')  # fmt: skip
+    path = stage(tmp_path, looks(CLEAR), mesh("Ball", one.points, one.triangles), speck)
+    assert run(path, tmp_path / "out.usda")["Glass"].model == "sphere"
 
 
 def test_thin_is_still_there_for_who_asks(tmp_path: Path) -> None:

@@ -258,6 +258,8 @@ def _model(glass: Glass, uses: list[Use], forced: str) -> tuple[Model, str, list
     if not fits:
         return SOLID, "nothing that is drawn is bound to it", notes
     best = together(fits)
+    if best.model.sized and (holder := next((use for use in uses if use.holds), None)):
+        return SOLID, f"{holder.path} holds {holder.holds}, which '{best.model.token}' would hide", notes
     opened = [use.path for use in uses if not all(fit.closed for fit in use.fits)]
     if best.model.behind is Behind.MESH and opened:
         notes.append(f"{opened[0]} is open, so it is drawn as '{SHEET.token}'; give it a material of its own to say so")

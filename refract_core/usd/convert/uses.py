@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Iterable, Iterator
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -37,6 +37,8 @@ class Use(NamedTuple):
     """It has primvars:refraction:thickness already."""
     cage: bool
     """The control cage of a subdivision surface that is too large to be subdivided, so it is what is drawn."""
+    holds: str = ""
+    """Path of something that stands within it, where it is a ball or a box; '' for nothing."""
 
 
 def find_uses(stage: Usd.Stage, time: Usd.TimeCode, materials: Iterable[str]) -> dict[str, list[Use]]:
@@ -76,7 +78,61 @@ def find_uses(stage: Usd.Stage, time: Usd.TimeCode, materials: Iterable[str]) ->
                 typed = bool(UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(THICKNESS_PRIMVAR))
                 edit = str(editable(prim) or "")
                 uses[wanted[place]].append(Use(str(prim.GetPath()), edit, found, whole, typed, shape.cage))
-    return uses
+    holders = {use.path for group in uses.values() for use in group if any(fit.model.sized for fit in use.fits)}
+    held = contents(stage, time, holders, prims, placements) if holders else {}
+    return {path: [use._replace(holds=held.get(use.path, "")) for use in group] for path, group in uses.items()}
+
+
+_LOOKED_AT = 64
+"""Places of a prim that are looked into; of more, an even choice stands for all."""
+
+
+def contents(
+    stage: Usd.Stage, time: Usd.TimeCode, holders: Collection[str], prims: list[Usd.Prim],
+    placements: Callable[[Usd.Prim], list[F64]],
+) -> dict[str, str]:  # fmt: skip
+    """Something that stands within a ball or box: what such a model hides, for it looks straight out of its far side.
+
+    A thing is within where its bounds are in those of the holder, and its middle in the ellipsoid that touches them.
+
+    Args:
+        holders: paths of the prims that are balls or boxes.
+        prims, placements: as `_drawn` gives them.
+
+    Returns:
+        By path of the holder, that of what it holds.
+    """
+    cache = UsdGeom.BBoxCache(time, [UsdGeom.Tokens.default_, UsdGeom.Tokens.render])
+    paths: list[str] = []
+    boxes: list[F64] = []
+    for prim in prims:
+        extent = cache.ComputeUntransformedBound(prim).ComputeAlignedRange()
+        if not extent.IsEmpty():
+            corners = np.array([(*extent.GetCorner(k), 1.0) for k in range(8)])
+            every = [corners @ place[:3].T for place in placements(prim)]
+            boxes += every
+            paths += [str(prim.GetPath())] * len(every)
+    if not boxes:
+        return {}
+    points, owners = np.stack(boxes), np.array(paths)
+    found: dict[str, str] = {}
+    for path in sorted(holders):
+        prim = stage.GetPrimAtPath(path)
+        extent = cache.ComputeUntransformedBound(prim).ComputeAlignedRange()
+        if extent.IsEmpty():
+            continue
+        middle, half = np.array(extent.GetMidpoint()), np.array(extent.GetSize()) / 2.0
+        places = placements(prim)
+        for row in np.unique(np.linspace(0, len(places) - 1, min(len(places), _LOOKED_AT)).astype(int)).tolist():
+            linear, origin = places[row][:3, :3], places[row][:3, 3]
+            if abs(np.linalg.det(linear)) < 1.0e-30 or not (half > 0.0).all():
+                continue
+            at = ((points - origin) @ np.linalg.inv(linear).T - middle) / half  # in a cube of -1 .. 1
+            inside = (np.abs(at) < 1.0 - 1.0e-6).all(axis=(1, 2)) & ((at.mean(axis=1) ** 2).sum(axis=1) < 1.0)
+            if (others := owners[inside & (owners != path)]).size:
+                found[path] = str(others[0])
+                break
+    return found
 
 
 def _drawn(
