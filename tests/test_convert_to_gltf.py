@@ -49,7 +49,8 @@ def shop(folder: Path, unit: float = 0.01) -> str:
         under("Turned", "((0, 2, 0, 0), (-2, 0, 0, 0), (0, 0, 2, 0), (10, 20, 30, 1))", cone("Cone", "Honey")),
         under("Mirrored", "((-1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (-9, 0, 0, 1))", cone("Cone", "Honey")),
         under("Sheared", "((1, 0.5, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 9, 0, 1))", cone("Cone", "Wall")),
-        ball("Ball", "Clear", 2.5), pane("Pane", "Window"),
+        ball("Ball", "Clear", 2.5, "double3 xformOp:translate = (20, 0, 0)",
+             'uniform token[] xformOpOrder = ["xformOp:translate"]'), pane("Pane", "Window"),
     ]  # fmt: skip
     path = folder / "shop.usda"
     inside = block('def Xform "W"', block('def Scope "Looks"', *materials), *prims)

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Sdf, Usd, UsdGeom, UsdLux
+from pxr import Usd, UsdGeom, UsdLux
 
 from ...scene import F32, F64, Material, Notice, Param
 from ...version import __version__
@@ -26,10 +26,10 @@ from ...world.solid import mean_way
 from ..geometry.parts import Part, Tables, assemble, bind
 from ..geometry.primvars import spread
 from ..geometry.shapes import read_shape
-from ..geometry.traverse import walk
 from ..geometry.triangulate import turned_over
 from ..stage import stage_unit, time_range
 from .gltf_materials import Maker, Uv, uvs_of
+from .uses import drawn
 
 _PURPOSES = ("default", "render")
 _FLOAT, _SHORT, _INT = 5126, 5123, 5125
@@ -124,31 +124,28 @@ def write_gltf(stage: Usd.Stage, out: str) -> Written:
 
 def _placed(stage: Usd.Stage, tables: Tables, metres_from_stage: F64) -> Iterator[_Placed]:
     """Everything with a surface, as the renderer reads it."""
-    placements = walk(stage, tables.time, _PURPOSES, tables.notices)
-    prims = list({placement.prim.GetPath(): placement.prim for placement in placements}.values())
-    parts: dict[Sdf.Path, Part] = {}
+    every, placements = drawn(stage, tables.time, tables.notices)
+    prims = [prim for prim in every if UsdGeom.Imageable(prim).ComputePurpose() in _PURPOSES]
     known: dict[tuple[Any, ...], Part] = {}
     for prim, bound in zip(prims, bind(prims, tables.notices), strict=True):
-        shape = read_shape(prim, tables.time, tables.notices)
+        places = placements(prim)
+        shape = read_shape(prim, tables.time, tables.notices) if places else None
         if shape is None:
             continue
         part = assemble(prim, shape, bound, tables)
         source = prim.GetPrimInPrototype().GetPath() if prim.IsInstanceProxy() else prim.GetPath()
         # Proxies of one prototype are one mesh, as far as they have the same materials and primvars.
-        same = source, part.materials.tobytes(), *(
-            value.tobytes() for _, value in sorted(part.primvars.items())
-        )  # fmt: skip
-        parts[prim.GetPath()] = known.setdefault(same, part)
-    for placement in placements:
-        part_here = parts.get(placement.prim.GetPath())
-        if part_here is None:
-            continue
-        matrix = metres_from_stage @ placement.world_from_prim @ part_here.shape.prim_from_shape
-        if not np.isfinite(matrix).all():
-            tables.notices.append(Notice(placement.path, "skipped: its transform is not finite"))
-            continue
-        turn, stretch = _rigid(matrix[:3, :3])
-        yield _Placed(placement.path, part_here, stretch, turn, matrix[:3, 3])
+        values = (primvar.tobytes() for _, primvar in sorted(part.primvars.items()))
+        part = known.setdefault((source, part.materials.tobytes(), *values), part)
+        for count, place in enumerate(places):
+            path = str(prim.GetPath()) + (f"[{count}]" if len(places) > 1 else "")
+            world = np.vstack((place[:3], (0.0, 0.0, 0.0, 1.0)))
+            matrix = metres_from_stage @ world @ part.shape.prim_from_shape
+            if np.isfinite(matrix).all():
+                turn, stretch = _rigid(matrix[:3, :3])
+                yield _Placed(path, part, stretch, turn, matrix[:3, 3])
+            else:
+                tables.notices.append(Notice(path, "skipped: its transform is not finite"))
 
 
 def _upright(stage: Usd.Stage) -> F64:

@@ -54,7 +54,7 @@ def find_uses(stage: Usd.Stage, time: Usd.TimeCode, materials: Iterable[str]) ->
     if not wanted:
         return {}
     notices: list[Notice] = []
-    prims, placements = _drawn(stage, time, notices)
+    prims, placements = drawn(stage, time, notices)
     uses: dict[str, list[Use]] = defaultdict(list)
     shapes: dict[Hashable, Shape | None] = {}
     fits: _Fits = {}
@@ -97,7 +97,7 @@ def contents(
 
     Args:
         holders: paths of the prims that are balls or boxes.
-        prims, placements: as `_drawn` gives them.
+        prims, placements: as `drawn` gives them.
 
     Returns:
         By path of the holder, that of what it holds.
@@ -135,7 +135,7 @@ def contents(
     return found
 
 
-def _drawn(
+def drawn(
     stage: Usd.Stage, time: Usd.TimeCode, notices: list[Notice]
 ) -> tuple[list[Usd.Prim], Callable[[Usd.Prim], list[F64]]]:
     """Every prim with a surface, and a function that gives where it is drawn: world_from_prim, shape (4, 4)."""
