@@ -12,7 +12,7 @@ from scenes import draw, globe, shell
 from test_convert import HEAD, block, run
 from test_convert_fit import TUMBLER, revolved
 
-from refract_core.scene import Mesh, Model
+from refract_core.scene import Mesh, Model, Param
 from refract_core.usd.stage import load_stage
 
 AMBER = "color3f inputs:transmission_color = (0.9, 0.5, 0.1)"
@@ -135,3 +135,17 @@ def test_amber_beads_of_one_centimetre_keep_their_colour(tmp_path: Path, shape: 
     assert np.abs(after - before).mean() < 5e-3  # the closed form of a ball is another one at its rim
     distances = [m.absorption_distance for one in (path, out) for m in load_stage(one).materials if m.refractive]
     assert distances[1] == pytest.approx(distances[0], rel=0.02)
+
+
+@pytest.mark.parametrize("to", ["", "openpbr", "preview", "gltf"])
+def test_a_colour_of_another_space_is_converted_once(tmp_path: Path, to: str) -> None:
+    """A stage whose colours are ACEScg by ColorSpaceAPI: what is written is read as what it was."""
+    path = Path(stage(tmp_path, looks(AMBER), ball("Bead", 1.0, "Glass")))
+    api = 'def Xform "W" (prepend apiSchemas = ["ColorSpaceAPI"])\n{\nuniform token colorSpace:name = "lin_ap1_scene"'
+    path.write_text(path.read_text().replace('def Xform "W"\n{', api))
+    out = tmp_path / "out.usda"
+    run(str(path), out, to=to)
+    before, after = (next(m for m in load_stage(one).materials if m.refractive) for one in (path, out))
+    plain = after.inputs[Param.TRANSMITTANCE].value
+    assert plain == pytest.approx(before.inputs[Param.TRANSMITTANCE].value, abs=1e-5)
+    assert plain[:3] != pytest.approx((0.9, 0.5, 0.1), abs=0.01)

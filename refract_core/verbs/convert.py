@@ -334,6 +334,6 @@ def _additions(glass: Glass, row: Row, per_prim: dict[str, float]) -> Iterable[A
     mine = {name: value for name, value in values.items() if name not in glass.authored}
     wired = {name: source for name, source in connections.items() if source and name not in glass.authored}
     made = {name: what for name, what in maps.items() if what is not None and name not in glass.authored}
-    yield Addition(glass.edit, True, mine, wired, made)
+    yield Addition(glass.edit, True, mine, wired, made, glass.space)
     for path, thickness in per_prim.items():
         yield Addition(path, False, {"primvars:refraction:thickness": thickness}, {})

@@ -47,6 +47,8 @@ class Addition(NamedTuple):
     """Attribute -> path of the output that drives it."""
     maps: Mapping[str, Mapped] = MappingProxyType({})
     """Attribute -> what drives it, where no output of the stage can be connected to: nodes are written for it."""
+    space: str = ""
+    """Colour space of the colours, where the stage gives the prim another one; '' where it gives it none."""
 
 
 def begin(path: str, *, flatten: bool, opening: Opening = AS_IT_IS) -> Work:
@@ -106,7 +108,10 @@ def add(layer: Sdf.Layer, additions: Iterable[Addition]) -> None:
             if addition.applies:
                 apply_api(spec, API)
             for name, value in addition.values.items():
-                _attribute(spec, name).default = Gf.Vec3f(*value) if isinstance(value, tuple) else value
+                attribute = _attribute(spec, name)
+                attribute.default = Gf.Vec3f(*value) if isinstance(value, tuple) else value
+                if isinstance(value, tuple) and addition.space:
+                    attribute.SetInfo("colorSpace", addition.space)
             driven = dict(addition.connections)
             for name, what in addition.maps.items():
                 label, color = name.rpartition(":")[2], _TYPES[name] == Sdf.ValueTypeNames.Color3f

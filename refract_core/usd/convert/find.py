@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from pxr import Sdf, Usd, UsdShade
+from pxr import Gf, Sdf, Usd, UsdShade
 
 from ...scene import Notice, Param, Source, Texture
 from ..materials.nodes import read_source
@@ -59,6 +59,8 @@ class Glass:
     authored: frozenset[str]
     """Names of our own attributes that are authored although the schema is not applied."""
     notes: tuple[str, ...]
+    space: str = ""
+    """What the colours' space is called where the stage gives the prim another one (ColorSpaceAPI); else ''."""
 
 
 def find_glass(stage: Usd.Stage, time: Usd.TimeCode, unit: float) -> list[Glass]:
@@ -123,7 +125,14 @@ def _read(prim: Usd.Prim, time: Usd.TimeCode, unit: float, textures: dict[str, T
         thickness_map=thickness_map,
         authored=frozenset(name for name in prim.GetAuthoredPropertyNames() if "refraction:" in name),
         notes=tuple(note for note in notes if note),
+        space=own_space(prim),
     )
+
+
+def own_space(prim: Usd.Prim) -> str:
+    """The name of linear Rec. 709, which every colour is read as, where a prim says that its colours are of another
+    space, or of this; '' where it says nothing."""
+    return str(Gf.ColorSpaceNames.LinearRec709) if Usd.ColorSpaceAPI.ComputeColorSpaceName(prim, None) else ""
 
 
 def _may_transmit(material: UsdShade.Material) -> bool:

@@ -17,7 +17,7 @@ from ..materials.read import read_material
 from ..materials.sources import is_constant, scaled
 from ..stage import stage_unit, time_range
 from ..values import neat
-from .find import editable
+from .find import editable, own_space
 from .networks import author, author_normal, connect, mapped, writable
 
 
@@ -124,7 +124,7 @@ def _write(
             if name in drivers:
                 drive(shader, name, _kind(name, value))
             else:
-                shader.CreateInput(name, _kind(name, value)).Set(_value(value))
+                _put(shader, name, value)
         yield f"{target.identifier} is written on {where}"
 
 
@@ -173,7 +173,7 @@ def _fill(
             if name in drivers:
                 drive(at, name, _kind(name, value))
             else:
-                at.CreateInput(name, _kind(name, value)).Set(_value(value))
+                _put(at, name, value)
             written.append(name)
         elif UsdShade.Output.IsOutput(made[0]) or not _same(made[0].Get(), value):
             stays.append(name)
@@ -181,6 +181,14 @@ def _fill(
         yield f"{target.identifier} gets {', '.join(written)}"
     if stays:
         yield f"{target.identifier} keeps its own {', '.join(stays)}"
+
+
+def _put(shader: UsdShade.Shader, name: str, value: Any) -> None:
+    """Author a number or colour, in the space that it was read in."""
+    port = shader.CreateInput(name, _kind(name, value))
+    port.Set(_value(value))
+    if isinstance(value, tuple) and name not in _NORMALS and (space := own_space(shader.GetPrim())):
+        port.GetAttr().SetColorSpace(space)
 
 
 def _same(found: Any, wanted: Any) -> bool:
