@@ -12,6 +12,7 @@ from pxr import Usd, UsdUtils
 from test_convert import material, run
 
 from refract_core.errors import ImageError
+from refract_core.images import codec
 from refract_core.scene import Model, Param, Source, Texture, Wrap
 from refract_core.usd.materials import udim
 from refract_core.usd.materials.textures import read_texture
@@ -142,6 +143,16 @@ def test_too_many_tiles_are_made_smaller_and_told(tmp_path: Path, monkeypatch: p
     seen = looked_up(found[Param.DIFFUSE], found.textures, 0.5, 0.5)
     assert seen[0] == pytest.approx(1.0, abs=0.01)
     assert seen[1] == pytest.approx(np.mean([10 * x + 5 for x in range(8)]), abs=1.0)
+
+
+def test_tiles_together_keep_the_limit_on_one_texture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a service sets it."""
+    tiles(tmp_path, (1001, 1002, 1003), side=8)
+    monkeypatch.setattr(codec, "MAX_TEXTURE_PIXELS", 100)
+    found = Reading(Usd.Stage.Open(str(stage(tmp_path))))
+    assert "at 1/" in found.texts
+    (texture,) = found.textures.values()
+    assert texture.pixels.shape[0] * texture.pixels.shape[1] <= 100
 
 
 def test_tiles_inside_a_package_are_read(tmp_path: Path) -> None:

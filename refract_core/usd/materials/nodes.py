@@ -38,7 +38,7 @@ from .sources import (
     single,
 )
 from .textures import read_texture, resolve_asset, texture_key
-from .udim import LARGEST, Tiled, moved_in
+from .udim import Tiled, moved_in
 
 _CHANNELS = {"r": Channel.R, "g": Channel.G, "b": Channel.B, "a": Channel.A, "rgb": Channel.RGB}
 _WRAPS = {"black": Wrap.BLACK, "clamp": Wrap.CLAMP, "repeat": Wrap.REPEAT, "mirror": Wrap.MIRROR}
@@ -126,7 +126,7 @@ def _loaded(context: Context, attribute: Usd.Attribute | None, color_space: str,
         made = context.textures[key]
         if isinstance(made, Tiled) and made.grid.step > 1:
             text = f"the {len(made.grid.cells)} tiles of {short(path)} are read at 1/{made.grid.step} of their size"
-            note(context, f"{text}: together they come to more than {LARGEST >> 30} GB", where)
+            note(context, f"{text}: together they are more than one texture may be", where)
     return list(context.textures).index(key)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import ImageError
+from ...images import codec
 from ...images.srgb import srgb_decode, srgb_encode
 from ...scene import Source, Texture, Wrap
 from ..values import short
@@ -24,7 +25,7 @@ from .coordinates import Matrix, compose
 MARK = "<UDIM>"
 FIRST, LAST, COLUMNS = 1001, 1100, 10
 LARGEST = 1 << 30
-"""Bytes of the picture; beyond, the tiles are made smaller."""
+"""Bytes of the picture; beyond, and beyond the pixels that one texture may have, the tiles are made smaller."""
 _RIM = 64
 """A rim is the tile's side over this."""
 
@@ -158,7 +159,7 @@ def _grid(cells: tuple[_Cell, ...], sizes: list[Size]) -> Grid:
         side = max(width // step, 1), max(height // step, 1)
         grid = Grid(cells, low, counts, side, (max(side[0] // _RIM, 1), max(side[1] // _RIM, 1)), step)
         rows, columns = grid.shape
-        if rows * columns * texel <= LARGEST or side == (1, 1):
+        if (rows * columns * texel <= LARGEST and rows * columns <= codec.MAX_TEXTURE_PIXELS) or side == (1, 1):
             return grid
         step *= 2
 
