@@ -250,6 +250,8 @@ MUTANTS = (
            "to.lamps[i] = 1 if meeting.kind[lane] == LEFT else 0", "to.lamps[i] = 0"),
     Mutant("a lamp's mirror picture twice", "transport/crossing.py",
            "to.lamps[i] = 1 if meeting.kind[lane] == LEFT else 0", "to.lamps[i] = 1"),
+    Mutant("corners that agree by chance are believed", "transport/corners.py",
+           "> _FAR_APART * answers.wide[found[0]]", "> 1e9 * answers.wide[found[0]]", CORNERS),
     Mutant("nobody looks in the middle", "transport/corners.py",
            "if not _is_between(", "if True or not _is_between(", CORNERS),
     Mutant("edges of brushed metal have one lobe", "transport/tree.py",

@@ -38,7 +38,19 @@ from scenes import (
 )
 
 import refract_core as rc
-from refract_core.scene import Environment, LightKind, Material, Mesh, Model, Scene, Source, Sphere, Texture, Volume
+from refract_core.scene import (
+    Channel,
+    Environment,
+    LightKind,
+    Material,
+    Mesh,
+    Model,
+    Scene,
+    Source,
+    Sphere,
+    Texture,
+    Volume,
+)
 from refract_core.settings import named_settings
 
 pytestmark = pytest.mark.draws
@@ -246,6 +258,28 @@ def test_a_checker_through_a_ball_is_drawn_as_by_many_samples() -> None:
     error = rms((mine["beauty"] - truth["beauty"])[here])
     assert error < 10 ** (-30 / 20)
     assert error < 10 ** (-10 / 20) * rms((single["beauty"] - truth["beauty"])[here])
+
+
+def test_stripes_that_run_into_the_distance_are_grey_there() -> None:
+    """A floor seen edge-on, striped across: a pixel that three periods or more run through differs from their mean by
+    less than a twelfth of black and white, whatever stripes its corners happen to stand on."""
+    pixels = np.zeros((16, 16, 4), np.float32)
+    pixels[:8] = 1.0
+    pixels[..., 3] = 1.0
+    stripes = material("/stripes", EMISSIVE=Source(texture=0, channel=Channel.RGB, uv_primvar="st"), IOR=1.0)
+    floor = quad("/floor", [(-400, 0, 0), (400, 0, 0), (400, 0, -800), (-400, 0, -800)])
+    floor = replace(floor, primvars={"st": floor.primvars["st"] * np.float32(800.0)})  # of a metre each
+    size = 64
+    slope = 0.2 * (2.0 * (np.arange(size + 1)) / size - 1.0)  # of the rays through the edges of rows, downwards
+    for height in np.linspace(0.8, 1.4, 13):
+        lens = camera((0, height, 0), (0, height, -1), 0.2)
+        what = scene([floor], [stripes], textures=(Texture("stripes", pixels),), cameras=(lens,))
+        seen = draw(what, size, size, **GOOD)["beauty"][..., 0].astype(np.float64)
+        depth = height / np.maximum(slope, 1e-6)
+        run = depth[:-1] - depth[1:]
+        far = (run >= 3.0) & (depth[:-1] < 700.0)
+        assert far.sum() >= 5
+        assert np.abs(seen[far] - 0.5).max() < 1.0 / 12.0 + 0.02
 
 
 # --- Quiet light ------------------------------------------------------------------------------------------------------

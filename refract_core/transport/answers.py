@@ -42,6 +42,8 @@ class Answers(NamedTuple):
     share: F64_1D
     """shape (R,): weight of the surface in the light: 1, or less where a probe has answered first; 0 where all of it is
     `rest`"""
+    wide: F64_1D
+    """shape (R,): of the cone over which emission and albedo are filtered, where it ends [m]"""
     weight: F64_2D
     """shape (R, 3)"""
     point: F64_2D
@@ -66,7 +68,7 @@ def new_answers(slots: int) -> Answers:
     kinds: list[Any] = [np.int32] * 4 + [np.float64] * 3
     hits = HitLanes(*(np.zeros(rows, kind) for kind in kinds))
     made: list[Any] = [np.zeros(1, np.int32), np.zeros(slots, np.int32)]
-    made += [np.zeros(rows, np.int32), np.zeros(rows, np.int32), hits, np.zeros(rows)]
+    made += [np.zeros(rows, np.int32), np.zeros(rows, np.int32), hits, np.zeros(rows), np.zeros(rows)]
     return Answers._make(made + [np.zeros((rows, 3)) for _ in range(8)])
 
 
@@ -107,7 +109,7 @@ def add_answer(answers: Answers, slot: int, leaves: Rays, k: int, query: Query, 
         put(answers.point, r, at.point)
         put(answers.normal, r, flip_towards(at.ng, scale(d, -1.0)))
     share = query.surface_share[lane]
-    answers.share[r] = share
+    answers.share[r], answers.wide[r] = share, query.width[lane]
     put(answers.emissive, r, row(query.emissive, lane))
     put(answers.albedo, r, row(query.albedo, lane))
     put(answers.irradiance, r, row(query.irradiance, lane))
@@ -138,13 +140,14 @@ def add_glow(answers: Answers, slot: int, light: Vec, side: int, way: int, what:
 
 @inlined
 def add_direct(
-    answers: Answers, slot: int, at: Interaction, direction: Vec, emissive: Vec, albedo: Vec, irradiance: Vec, rest: Vec
-) -> None:
+    answers: Answers, slot: int, at: Interaction, direction: Vec, emissive: Vec, albedo: Vec, irradiance: Vec,
+    rest: Vec, wide: float,
+) -> None:  # fmt: skip
     """Keep an opaque surface that a view ray sees."""
     answers.filled[slot] = 1
     r = slot * MOST_ANSWERS
     keep_hit(answers.hits, r, at.hit)
-    answers.way[r], answers.side[r], answers.share[r] = at.hit.part, VIEW, 1.0
+    answers.way[r], answers.side[r], answers.share[r], answers.wide[r] = at.hit.part, VIEW, 1.0, wide
     put(answers.weight, r, (1.0, 1.0, 1.0))
     put(answers.point, r, at.point)
     put(answers.direction, r, direction)

@@ -50,6 +50,8 @@ _PER_TOLERANCE = 0.8
 """Samples, to the power of 3/4, for each tolerance that corners differ by."""
 _PAINTED = 0.2
 """Times the tolerance, below which a texture is not looked at between the corners."""
+_FAR_APART = 2.5
+"""Times the width that corners look at, from which on what lies between them is looked at whatever they say."""
 _ALL_SAMPLES = 2
 """The set of samples of a pixel that takes all."""
 _EDGE_ON = 0.1
@@ -231,7 +233,7 @@ def _keep_opaque(
     at = interaction(world.geometry, hit, Ray(origin, direction), view.spread * t)
     emissive, albedo = row(hits.emissive[y], x), row(hits.albedo[y], x)
     irradiance, gloss = row(opaque.irradiance[y], x), row(opaque.gloss[y], x)
-    add_direct(scratch.answers, slot, at, direction, emissive, albedo, irradiance, gloss)
+    add_direct(scratch.answers, slot, at, direction, emissive, albedo, irradiance, gloss, view.spread * t)
 
 
 @inlined
@@ -376,6 +378,11 @@ def _is_painted(
     hit = kept_hit(answers.hits, found[0])
     if world.materials.driven[hit.material] == 0 or world.geometry.sphere[hit.part, 3] > 0.0:
         return False
+    # Corners that lie farther apart than each of them looks may agree by chance, as on a floor that is seen edge-on.
+    sides = _sides(answers, found)
+    apart = max(sides[0], sides[1]) > _FAR_APART * answers.wide[found[0]]
+    if apart and max(weight[0], weight[1], weight[2]) * answers.share[found[0]] > _PAINTED * refining.tolerance:
+        return True
     for c in range(3):
         low, high = math.inf, -math.inf
         for k in range(4):
@@ -390,14 +397,26 @@ def _is_painted(
 
 
 @inlined
+def _sides(answers: Answers, found: I64_1D) -> tuple[float, float]:
+    """How wide and how high the quadrilateral between the points is where four rays meet a surface [m]."""
+    a, b = row(answers.point, found[0]), row(answers.point, found[1])
+    c, d = row(answers.point, found[2]), row(answers.point, found[3])
+    wide = 0.5 * (length(sub(b, a)) + length(sub(d, c)))
+    return wide, 0.5 * (length(sub(c, a)) + length(sub(d, b)))
+
+
+@inlined
 def _filter(scratch: TreeScratch, own: CornerScratch, world: World) -> None:
     """Emission and albedo of a surface, over the quadrilateral between the points where four rays meet it."""
     answers, found, block = scratch.answers, own.found, scratch.block_of_one
     a, b = row(answers.point, found[0]), row(answers.point, found[1])
     c, d = row(answers.point, found[2]), row(answers.point, found[3])
-    wide = 0.5 * (length(sub(b, a)) + length(sub(d, c)))
-    high = 0.5 * (length(sub(c, a)) + length(sub(d, b)))
-    step = max(0.5 * min(wide, high), max(wide, high) / _MOST_TAPS, 1e-9)
+    wide, high = _sides(answers, found)
+    narrow = max(min(wide, high), 1e-9)
+    step = max(0.5 * narrow, max(wide, high) / _MOST_TAPS)
+    # Of the distance between taps, each looks at half: what a mip level holds reaches twice as far. Where that is not
+    # enough for a long quadrilateral, it looks at more, up to all of it.
+    look = step * min(1.0, step / narrow)
     across, down = min(_MOST_TAPS, math.ceil(wide / step - 1e-6)), min(_MOST_TAPS, math.ceil(high / step - 1e-6))
     across, down = max(across, 2), max(down, 2)
     emissive, albedo = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
@@ -417,17 +436,13 @@ def _filter(scratch: TreeScratch, own: CornerScratch, world: World) -> None:
             hit = _moved(world, kept_hit(answers.hits, near), sub(p, row(answers.point, near)))
             wo = scale(row(answers.direction, near), -1.0)
             if alone:
-                shines, sends = paint(Interaction(hit, p, wo, wo, _SHARPER * step), world, share)
+                shines, sends = paint(Interaction(hit, p, wo, wo, look), world, share)
             else:
-                load_surface(block, 0, interaction(world.geometry, hit, Ray(p, wo), _SHARPER * step), world, wo)
+                load_surface(block, 0, interaction(world.geometry, hit, Ray(p, wo), look), world, wo)
                 shines, sends = row(block.emissive, 0), row(block.albedo, 0)
             emissive, albedo = add(emissive, shines), add(albedo, sends)
     put(own.filtered, 0, scale(emissive, 1.0 / (across * down)))
     put(own.filtered, 1, scale(albedo, 1.0 / (across * down)))
-
-
-_SHARPER = 0.5
-"""Of the distance between taps, what each of them sees of the texture: what a mip level holds reaches twice as far."""
 
 
 @inlined
