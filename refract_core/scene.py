@@ -8,8 +8,12 @@ Every record pickles.
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import cached_property
+from typing import NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -179,6 +183,93 @@ class Sphere:
     primvars: dict[str, F32] = field(default_factory=dict)
     """name -> shape (1, 1, D): constants only."""
     static: bool = True
+
+
+class Run(NamedTuple):
+    """Paths that differ in numbers alone, as a point instancer gives them: `/P/[7]/Leaf`."""
+
+    pieces: tuple[str, ...]
+    """What stands before, between and behind the numbers"""
+    numbers: I32
+    """shape (N, len(pieces) - 1)"""
+
+    def path(self, row: int) -> str:
+        """One of them."""
+        middle = (str(n) + piece for n, piece in zip(self.numbers[row].tolist(), self.pieces[1:], strict=True))
+        return self.pieces[0] + "".join(middle)
+
+
+@dataclass(frozen=True)
+class Paths(Sequence[str]):
+    """Paths of many things, written when one is asked for: a million of them are a million numbers."""
+
+    runs: tuple[str | Run, ...]
+    """In order; a text is one path"""
+
+    @cached_property
+    def _ends(self) -> list[int]:
+        sizes = (1 if isinstance(run, str) else len(run.numbers) for run in self.runs)
+        return np.cumsum(list(sizes)).tolist() if self.runs else []
+
+    def __len__(self) -> int:
+        return self._ends[-1] if self._ends else 0
+
+    @overload
+    def __getitem__(self, index: int) -> str: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[str]: ...
+    def __getitem__(self, index: int | slice) -> str | list[str]:
+        if isinstance(index, slice):
+            return [self[k] for k in range(*index.indices(len(self)))]
+        index = index + len(self) if index < 0 else index
+        if not 0 <= index < len(self):
+            raise IndexError(index)
+        at = bisect_right(self._ends, index)
+        run = self.runs[at]
+        return run if isinstance(run, str) else run.path(index - (self._ends[at - 1] if at else 0))
+
+    def __iter__(self) -> Iterator[str]:
+        for run in self.runs:
+            if isinstance(run, str):
+                yield run
+            else:
+                yield from (run.path(row) for row in range(len(run.numbers)))
+
+    def owners(self) -> Iterator[tuple[str, int]]:
+        """The prims they belong to (`prim_of`), in order, and how many of them do."""
+        for run in self.runs:
+            if isinstance(run, str):
+                yield prim_of(run), 1
+            elif len(run.numbers):
+                yield prim_of(run.path(0)), len(run.numbers)
+
+    def take(self, chosen: NDArray[np.integer]) -> Paths:
+        """Those at places, which ascend."""
+        kept: list[str | Run] = []
+        starts = np.searchsorted(chosen, [0, *self._ends])
+        for k, run in enumerate(self.runs):
+            mine = chosen[starts[k] : starts[k + 1]]
+            if len(mine):
+                first = self._ends[k - 1] if k else 0
+                kept.append(run if isinstance(run, str) else Run(run.pieces, run.numbers[mine - first]))
+        return Paths(tuple(kept))
+
+
+@dataclass(frozen=True)
+class Instances:
+    """One mesh in many places, each of which is a thing of its own."""
+
+    mesh: Mesh
+    """In a frame of its own, best about its middle; what it says of itself holds for all, its path but for messages"""
+    transforms: F32
+    """shape (N, 3, 4): engine world from the mesh's frame [m]; none flattens. What one mirrors is not inside out"""
+    paths: Paths
+    """N of them"""
+    primvars: dict[str, F32] = field(default_factory=dict)
+    """name -> shape (N, D): one value for all of an instance; of other names than the mesh's own"""
+
+    def __len__(self) -> int:
+        return len(self.transforms)
 
 
 class LightKind(IntEnum):
@@ -426,3 +517,5 @@ class Scene:
     name: str = ""
     """The file it was read from."""
     notices: tuple[Notice, ...] = ()
+    instances: tuple[Instances, ...] = ()
+    """Things like the meshes; a reader makes them where there are many of one"""

@@ -12,8 +12,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene import Environment, Light, Material, Mesh, Notice, Param, Probe, Scene, Source, Sphere, Texture, prim_of
+from ..scene import (
+    Environment,
+    Instances,
+    Light,
+    Material,
+    Mesh,
+    Notice,
+    Param,
+    Probe,
+    Scene,
+    Source,
+    Sphere,
+    Texture,
+    prim_of,
+)
 from ..version import __version__
+from ..world.instances import within
 
 _UNSEEN = (Param.THICKNESS, Param.TRANSMITTANCE)  # of what is behind a surface; an opaque one does not ask
 
@@ -46,6 +61,9 @@ def probe_digest(scene: Scene, probe: Probe) -> str:
     for thing in things:
         if (thing.static or probe.mode == "realtime") and (wanted is None or prim_of(thing.path) in wanted):
             seen.append(_of_thing(scene, thing))
+    for many in scene.instances:
+        if many.mesh.static or probe.mode == "realtime":
+            seen.append(_instances(scene, many if wanted is None else within(many, frozenset(wanted))))
     total = hashlib.sha256()
     _feed(total, "capture", probe.capture_point, probe.clipping, probe.resolution)
     _feed(total, "background", () if probe.background is None else probe.background)
@@ -53,6 +71,7 @@ def probe_digest(scene: Scene, probe: Probe) -> str:
     _feed_all(total, "seen", (one for one in seen if one))
     # What glows lights what the probe sees, though it may not see it.
     shining = [_of_thing(scene, thing) for thing in things if any(emits[m] for m in _used(thing))]
+    shining += [_instances(scene, many) for many in scene.instances if any(emits[m] for m in _used(many.mesh))]
     if any(shining):
         _feed_all(total, "glow", (one for one in shining if one))
     _feed_all(total, "lights", (_remembered(light, _light) for light in scene.lights))
@@ -160,6 +179,21 @@ def _sphere(scene: Scene, ball: Sphere) -> bytes:
     _feed(total, "sphere", ball.centre, ball.radius, _material(scene, ball.material))
     for name in sorted(set(_primvars_of(material)) & ball.primvars.keys()):
         _feed(total, name, ball.primvars[name])
+    return total.digest()
+
+
+def _instances(scene: Scene, many: Instances) -> bytes:
+    """Digest of a mesh in many places, in whatever order; empty where it has nothing opaque, or no place."""
+    mesh = _mesh(scene, many.mesh) if len(many) else b""
+    if not mesh:
+        return b""
+    read = {name for m in _used(many.mesh) for name in _primvars_of(scene.materials[m])}
+    names = sorted(read & many.primvars.keys())
+    columns = [many.transforms.reshape(len(many), -1), *(many.primvars[name] for name in names)]
+    rows = np.ascontiguousarray(np.concatenate(columns, axis=1), np.float32)
+    order = np.lexsort(rows.view(np.uint32).T)
+    total = hashlib.sha256()
+    _feed(total, "instances", mesh, *names, rows[order])
     return total.digest()
 
 

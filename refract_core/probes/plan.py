@@ -9,6 +9,7 @@ proxy` is a volume to guess distances by, and gets one that shows nothing.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,10 +17,12 @@ from numpy.typing import NDArray
 
 from ..scene import Camera, Material, Notice, Param, Probe, Scene, Volume, prim_of
 from ..world.embree import CASTER_SHIFTS, FIRST_CAPTURED_BIT, OPAQUE, OPAQUE_STATIC
+from ..world.instances import boxes, thing_count
 from ..world.tables import caster_sets
 from .lookup import bounds_of, camera_weight
 
-Box = tuple[NDArray[np.float64], NDArray[np.float64]]
+_MOST_PROXIES = 4096
+"""Things that have a box to guess by for themselves."""
 
 
 class Entry(NamedTuple):
@@ -57,7 +60,7 @@ def plan_capture(scene: Scene, probes: list[Probe]) -> Plan:
     sets: list[frozenset[str] | None] = []
     notices: list[Notice] = []
     entries = [Entry(probe, _mask_of(scene, probe, sets, notices), True) for probe in probes]
-    return Plan(entries, np.full(len(scene.meshes) + len(scene.spheres), -1, np.int32), sets, tuple(notices))
+    return Plan(entries, np.full(thing_count(scene), -1, np.int32), sets, tuple(notices))
 
 
 def plan_picture(scene: Scene, camera: Camera, *, drawn: bool, proxies: bool) -> Plan:
@@ -67,39 +70,44 @@ def plan_picture(scene: Scene, camera: Camera, *, drawn: bool, proxies: bool) ->
         drawn: the probe tier is going to be asked.
         proxies: the screen tier is going to guess by proxies, of which every piece of glass needs one.
     """
-    thing_probe = np.full(len(scene.meshes) + len(scene.spheres), -1, np.int32)
+    thing_probe = np.full(thing_count(scene), -1, np.int32)
     asked = proxies or (drawn and scene.probes)
-    if not asked or not (glass := _glass(scene)):
+    if not asked or not len((glass := _glass(scene)).thing):
         return Plan([], thing_probe, [])
-    serving = [p for p in in_order(list(scene.probes)) if _serves(p, camera, glass, scene)]
+    serving = [p for p in in_order(list(scene.probes)) if _serves(p, camera, glass)]
     plan = plan_capture(scene, serving)
     entries = [entry._replace(drawn=drawn) for entry in plan.entries]
     for k, entry in reversed(list(enumerate(entries))):
-        for thing, (low, high) in glass.items():
-            if contains(entry.probe.influence, (low + high) / 2):
-                thing_probe[thing] = k
-    for thing, box in glass.items() if proxies else ():
-        if thing_probe[thing] < 0:
-            thing_probe[thing] = len(entries)
-            entries.append(Entry(_bare_proxy(box if scene.probes else scene.bounds), 0, False))
+        thing_probe[glass.thing[contains(entry.probe.influence, (glass.low + glass.high) / 2)]] = k
+    if proxies:
+        _lend_proxies(scene, glass, thing_probe, entries)
     return plan._replace(entries=entries, thing_probe=thing_probe)
 
 
-def _serves(probe: Probe, camera: Camera, glass: dict[int, Box], scene: Scene) -> bool:
+def _lend_proxies(scene: Scene, glass: _Glass, thing_probe: NDArray[np.int32], entries: list[Entry]) -> None:
+    """A box to guess by for all glass that no probe serves. Things beyond `_MOST_PROXIES` share one around them all."""
+    bare = np.flatnonzero(thing_probe[glass.thing] < 0)
+    for row in bare[:_MOST_PROXIES]:
+        thing_probe[glass.thing[row]] = len(entries)
+        box = (glass.low[row], glass.high[row]) if scene.probes else scene.bounds
+        entries.append(Entry(_bare_proxy(box), 0, False))
+    rest = bare[_MOST_PROXIES:]
+    if len(rest):
+        thing_probe[glass.thing[rest]] = len(entries)
+        box = (glass.low[rest].min(axis=0), glass.high[rest].max(axis=0)) if scene.probes else scene.bounds
+        entries.append(Entry(_bare_proxy(box), 0, False))
+
+
+def _serves(probe: Probe, camera: Camera, glass: _Glass) -> bool:
     """Some glass, widened by how far its rays may travel inside, lies within the probe's influence."""
     if camera_weight(probe, camera.world_from_camera[:3, 3]) <= 0.0:
         return False
     low, high = bounds_of(probe)
-    for thing, (least, most) in glass.items():
-        margin = float(np.linalg.norm(most - least)) + _longest_thickness(scene, thing)
-        if (least - margin <= high).all() and (most + margin >= low).all():
-            return True
-    return False
+    margin = (np.linalg.norm(glass.high - glass.low, axis=1) + glass.thickness)[:, None]
+    return bool(((glass.low - margin <= high) & (glass.high + margin >= low)).all(axis=1).any())
 
 
-def _longest_thickness(scene: Scene, thing: int) -> float:
-    count = len(scene.meshes)
-    used = np.unique(scene.meshes[thing].materials) if thing < count else [scene.spheres[thing - count].material]
+def _longest_thickness(scene: Scene, used: Iterable[int]) -> float:
     return max((_thickness_bound(scene.materials[int(m)]) for m in used), default=0.0)
 
 
@@ -110,28 +118,52 @@ def _thickness_bound(material: Material) -> float:
     return max(source.value[0], abs(source.scale[0]) + abs(source.bias[0]) if source.texture >= 0 else 0.0)
 
 
-def _glass(scene: Scene) -> dict[int, Box]:
-    """Bounds of every thing with a refractive material, by its number."""
+class _Glass(NamedTuple):
+    """Every thing with a refractive material: K rows, by their numbers."""
+
+    thing: NDArray[np.int64]
+    low: NDArray[np.float64]
+    """shape (K, 3): bounds of what of it is glass [m]"""
+    high: NDArray[np.float64]
+    thickness: NDArray[np.float64]
+    """shape (K,): the most that it may have [m]"""
+
+
+def _glass(scene: Scene) -> _Glass:
     refractive = np.array([m.refractive for m in scene.materials], bool)
-    found = {}
+    found: list[tuple[Any, Any, Any, Any]] = [(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))]
     for thing, mesh in enumerate(scene.meshes):
         keep = refractive[mesh.materials]
         if keep.any():
             points = mesh.points[mesh.triangles[keep].ravel()].astype(np.float64)
-            found[thing] = (points.min(0), points.max(0))
+            longest = _longest_thickness(scene, np.unique(mesh.materials))
+            found.append(([thing], points.min(0)[None], points.max(0)[None], [longest]))
     for i, ball in enumerate(scene.spheres):
         if refractive[ball.material]:
-            centre = np.array(ball.centre, np.float64)
-            found[len(scene.meshes) + i] = (centre - ball.radius, centre + ball.radius)
-    return found
+            centre = np.array([ball.centre], np.float64)
+            longest = _longest_thickness(scene, [ball.material])
+            found.append(([len(scene.meshes) + i], centre - ball.radius, centre + ball.radius, [longest]))
+    first = len(scene.meshes) + len(scene.spheres)
+    for many in scene.instances:
+        keep = refractive[many.mesh.materials]
+        if keep.any() and len(many):
+            corners = np.unique(many.mesh.triangles[keep])
+            longest = _longest_thickness(scene, np.unique(many.mesh.materials))
+            low, high = boxes(many, many.mesh.points[corners].astype(np.float64))
+            found.append((first + np.arange(len(many)), low, high, np.full(len(many), longest)))
+        first += len(many)
+    return _Glass(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 
 def seen_things(scene: Scene, probe: Probe) -> frozenset[str]:
     """Prim paths of what a probe's `captured` collection leaves it, glass included."""
     baked = probe.mode != "realtime"
-    things = [(m.path, m.static) for m in scene.meshes] + [(s.path, s.static) for s in scene.spheres]
-    here = [prim_of(path) for path, static in things if static or not baked]
-    return frozenset(here if probe.captured is None else set(here) & set(probe.captured))
+    here = {prim_of(mesh.path) for mesh in scene.meshes if mesh.static or not baked}
+    here |= {prim_of(ball.path) for ball in scene.spheres if ball.static or not baked}
+    for many in scene.instances:
+        if many.mesh.static or not baked:
+            here.update(owner for owner, _ in many.paths.owners())
+    return frozenset(here if probe.captured is None else here & set(probe.captured))
 
 
 def _mask_of(scene: Scene, probe: Probe, sets: list[frozenset[str] | None], notices: list[Notice]) -> int:
@@ -149,13 +181,13 @@ def _mask_of(scene: Scene, probe: Probe, sets: list[frozenset[str] | None], noti
     return 1 << (FIRST_CAPTURED_BIT + sets.index(seen))
 
 
-def contains(volume: Volume, point: NDArray[np.float64]) -> bool:
-    """The point is inside the box or sphere."""
+def contains(volume: Volume, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which points, shape (K, 3), are inside the box or sphere."""
     m = np.linalg.inv(volume.world_from_volume)
-    p = m[:3, :3] @ point + m[:3, 3]
+    p = points @ m[:3, :3].T + m[:3, 3]
     if volume.sphere:
-        return bool(np.linalg.norm(p) <= volume.extents[0])
-    return bool((np.abs(p) <= np.array(volume.extents)).all())
+        return np.asarray(np.linalg.norm(p, axis=1) <= volume.extents[0])
+    return np.asarray((np.abs(p) <= np.array(volume.extents)).all(axis=1))
 
 
 def _bare_proxy(box: Any) -> Probe:

@@ -28,8 +28,9 @@ from ..world.caustics import (
     no_caustics,
     raise_levels,
 )
-from ..world.solid import across, along_a_curve, areas, encloses
-from ..world.tables import GlassShade, World, rows_of
+from ..world.instances import around, instances_at
+from ..world.solid import across, along_a_curve, encloses
+from ..world.tables import GlassShade, World, places_of, rows_of
 from .work import Work
 
 _CUT = 0.01
@@ -74,13 +75,23 @@ def _throws_caustics(world: World) -> NDArray[np.bool_]:
 
 
 def _corners(world: World, part: int) -> F64:
-    """Shape (T, 3, 3) [m]."""
+    """Shape (T, 3, 3) [m]; in the frame of a part with many places."""
     corners: F64 = world.geometry.points[world.geometry.triangles[rows_of(world.geometry, part)]].astype(np.float64)
     return corners
 
 
+def _spread(transforms: NDArray[np.float32], normals: F64) -> F64:
+    """Areas of triangles in some places, shape (N, T) [m^2]. `normals`: as `solid.across`, in their own frame."""
+    x, y, z = (transforms[:, k, :3].astype(np.float64) for k in range(3))
+    cofactors = np.stack([np.cross(y, z), np.cross(z, x), np.cross(x, y)], axis=1)
+    area: F64 = 0.5 * np.linalg.norm(cofactors @ normals.T, axis=1)
+    return area
+
+
 def _is_plate(world: World, part: int) -> bool:
-    normals = across(_corners(world, part))
+    """Of many places the first stands for all."""
+    linear = places_of(world.geometry, part)[0, :, :3].astype(np.float64)
+    normals = across(_corners(world, part) @ linear.T)
     area = np.linalg.norm(normals, axis=1)
     if not area.any():
         return True
@@ -95,21 +106,23 @@ def _is_plate(world: World, part: int) -> bool:
 def _sources(world: World, scene: Scene, casts: NDArray[np.bool_]) -> Sources:
     """Every piece of glass before every light; of very many, an even choice by area stands for all."""
     shadowing = _shadowing(world)
-    parts, primitives, area = _pieces(world, casts)
+    parts, instances, primitives, area = _pieces(world, casts)
     most = max(1, _MOST_SOURCES // max(1, len(shadowing)))
     if len(area) > most:
         edges = np.cumsum(area) / area.sum()
         kept = np.searchsorted(edges, (np.arange(most) + 0.5) / most)
-        parts, primitives, area = parts[kept], primitives[kept], np.full(most, area.sum() / most)
+        parts, instances, primitives = parts[kept], instances[kept], primitives[kept]
+        area = np.full(most, area.sum() / most)
     rows: list[list[Any]] = []
     for light in shadowing:
         within = _bodies_around(world, scene, light, np.flatnonzero(casts))
-        for side, these in ((1.0, np.arange(len(parts))), (-1.0, np.flatnonzero(np.isin(parts, within)))):
+        lit_from_inside = np.flatnonzero(np.isin(world.geometry.surface[parts] + instances, within))
+        for side, these in ((1.0, np.arange(len(parts))), (-1.0, lit_from_inside)):
             same = np.ones(len(these))
-            rows.append([same * light, parts[these], primitives[these], same * side, area[these]])
+            rows.append([same * light, parts[these], instances[these], primitives[these], same * side, area[these]])
     columns: list[Any] = [np.concatenate(column) for column in zip(*rows, strict=True)]
-    light_of, part, primitive = (column.astype(np.int32) for column in columns[:3])
-    return Sources(light_of, part, primitive, columns[3], columns[4], np.zeros(len(part)))
+    light_of, part, instance, primitive = (column.astype(np.int32) for column in columns[:4])
+    return Sources(light_of, part, instance, primitive, columns[4], columns[5], np.zeros(len(part)))
 
 
 def _shadowing(world: World) -> list[int]:
@@ -119,52 +132,68 @@ def _shadowing(world: World) -> list[int]:
     return [*found, count] if world.environment.present and not world.environment.dark else found
 
 
-def _pieces(world: World, casts: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64], F64]:
-    """Part, primitive and area [m^2] of all triangles of glass, neighbours together, and of spheres' patches."""
-    found: list[tuple[Any, Any, Any]] = []
+def _pieces(
+    world: World, casts: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], F64]:
+    """Part, place, primitive and area [m^2] of all triangles of glass, neighbours together, and of spheres' patches. Of
+    very many places of one mesh, an even choice stands for all."""
+    found: list[tuple[Any, Any, Any, Any]] = []
     for g in np.flatnonzero(casts):
         radius = float(world.geometry.sphere[g, 3])
         if radius > 0.0:
             count = BANDS * SECTORS
             order, area = np.arange(count), np.full(count, 4.0 * math.pi * radius * radius / count)
-        else:
-            corners = _corners(world, int(g))
-            order = along_a_curve(corners.mean(axis=1))
-            area = areas(corners)[order]
-        found.append((np.full(len(order), g), order, area))
-    whose, primitives, sizes = (np.concatenate(column) for column in zip(*found, strict=True))
-    return whose, primitives, sizes
+            found.append((np.full(count, g), np.zeros(count, np.int64), order, area))
+            continue
+        corners, transforms = _corners(world, int(g)), places_of(world.geometry, int(g))
+        order = along_a_curve(corners.mean(axis=1))
+        chosen, share = np.zeros(1, np.int64), 1.0
+        if len(transforms) > 1:
+            chosen = along_a_curve(transforms[:, :, 3].astype(np.float64))
+            most = max(1, _MOST_SOURCES // len(order))
+            if len(chosen) > most:
+                chosen, share = chosen[np.linspace(0, len(chosen) - 1, most).astype(np.int64)], len(chosen) / most
+        area = share * _spread(transforms[chosen], across(corners))[:, order].ravel()
+        places, primitives = np.repeat(chosen, len(order)), np.tile(order, len(chosen))
+        found.append((np.full(len(places), g), places, primitives, area))
+    whose, instances, primitives, sizes = (np.concatenate(column) for column in zip(*found, strict=True))
+    return whose, instances, primitives, sizes
 
 
 def _bodies_around(world: World, scene: Scene, light: int, parts: NDArray[np.int64]) -> list[int]:
-    """The bodies that a light stands in: its rays come to them from inside."""
+    """The surfaces of bodies that a light stands in: its rays come to them from inside."""
     lamps = world.lights
     if light == len(lamps.kind) or lamps.kind[light] == LightKind.DISTANT:
         return []
     at = lamps.axes[light, 3]
     found = []
     for g in parts:
-        thing = int(world.geometry.thing[g])
+        thing, surface = int(world.geometry.thing[g]), int(world.geometry.surface[g])
         if world.geometry.sphere[g, 3] > 0.0:
             if math.dist(at, world.geometry.sphere[g, :3]) < world.geometry.sphere[g, 3]:
-                found.append(int(g))
+                found.append(surface)
+            continue
+        if world.geometry.place[g] >= 0:
+            found += [surface + k for k in around(instances_at(scene, thing), at)]
             continue
         if encloses(scene.meshes[thing].points, scene.meshes[thing].triangles, at):
-            found.append(int(g))
+            found.append(surface)
     return found
 
 
 # --- how fine -----------------------------------------------------------------------------------------------------
 
 
-def _bounds(world: World, part: int) -> tuple[F64, float]:
-    """Middle and radius of a part's box [m]."""
+def _bounds(world: World, part: int) -> tuple[F64, F64]:
+    """Middles (N, 3) and radii (N,) of the boxes of a part in its places [m]."""
     ball = world.geometry.sphere[part]
     if ball[3] > 0.0:
-        return ball[:3].astype(np.float64), float(ball[3])
+        return ball[None, :3].astype(np.float64), ball[3:].astype(np.float64)
     corners = _corners(world, part).reshape(-1, 3)
     low, high = corners.min(axis=0), corners.max(axis=0)
-    return (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    places = places_of(world.geometry, part).astype(np.float64)
+    linear, origin = places[:, :, :3], places[:, :, 3]
+    return linear @ ((low + high) / 2) + origin, np.linalg.norm(np.abs(linear) @ (high - low), axis=1) / 2
 
 
 def _texels(world: World, casts: NDArray[np.bool_], camera: Camera, width: int) -> tuple[F64, NDArray[np.int32]]:
@@ -174,10 +203,10 @@ def _texels(world: World, casts: NDArray[np.bool_], camera: Camera, width: int) 
     left, right = camera.window[0], camera.window[1]
     for g in np.flatnonzero(casts):
         middle, radius = _bounds(world, int(g))
-        away = 1.0 if camera.orthographic else max(math.dist(camera.world_from_camera[:3, 3], middle), radius / 2)
-        pixel = away * (right - left) / width
-        wanted[g] = _PIXELS * pixel
-        largest = max(largest, min(radius / 4, _COARSE * pixel))
+        away = np.maximum(np.linalg.norm(middle - camera.world_from_camera[:3, 3], axis=1), radius / 2)
+        pixel = (np.ones(1) if camera.orthographic else away) * (right - left) / width
+        wanted[g] = _PIXELS * pixel.min()
+        largest = max(largest, float(np.minimum(radius / 4, _COARSE * pixel).max()))
     top = 2.0 ** math.ceil(math.log2(largest))
     finest[casts] = np.clip(np.ceil(np.log2(top / wanted[casts])), 0, LEVELS - 1)
     texel: F64 = top * np.power(0.5, np.arange(int(finest.max()) + 1))

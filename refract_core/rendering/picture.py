@@ -26,6 +26,7 @@ from ..version import __version__
 from ..view.camera import image_size, view_of
 from ..view.planes import by_name, finish_of, finish_tile, new_planes
 from ..world.embree import Bvh
+from ..world.instances import settled, thing_count, within
 from ..world.tables import World
 from .branching import Tree, needs_compiling, sample_views
 from .ready import PROBE_SAMPLES, Ready, choose_camera, prepare, prepare_bare
@@ -64,6 +65,7 @@ def render(
     settings = settings or RenderSettings()
     if not settings.camera_light:
         scene = replace(scene, camera_light=False)
+    scene = settled(scene)
     camera = choose_camera(scene, settings.camera)
     width, height = image_size(camera, settings.image_width, settings.image_height)
     with working(executor, settings.jobs, progress, cancel) as work:
@@ -126,7 +128,8 @@ def open_meshes(scene: Scene, model: str) -> tuple[Notice, ...]:
     asked = [BY_TOKEN[model] if model else m.model for m in scene.materials]
     walked = [m.refractive and to.behind is Behind.MESH for m, to in zip(scene.materials, asked, strict=True)]
     found = []
-    for mesh in scene.meshes:
+    firsts = [replace(many.mesh, path=many.paths[0]) for many in scene.instances if len(many)]
+    for mesh in (*scene.meshes, *firsts):
         if not mesh.closed and (mine := {asked[k] for k in np.unique(mesh.materials).tolist() if walked[k]}):
             what = f"the mesh is open, so '{min(mine).token}' finds no far side; drawn as '{SHEET.token}'"
             found.append(Notice(mesh.path, f"{what}. Close the mesh, or set another model"))
@@ -191,7 +194,7 @@ def glass_over(
             tiers = ("ray",) if probe.background else ("ray", "sky")
             asked = replace(settings, samples=samples, tiers=tiers, screen="traced", exposure=0.0)
             if probe.captured is None:
-                nobody = np.full(len(scene.meshes) + len(scene.spheres), -1, np.int32)
+                nobody = np.full(thing_count(scene), -1, np.int32)
                 ready, seen = Ready(world, bvh, empty_table([], [], camera, False), nobody, 0, ()), scene
             else:
                 seen = _part_of(scene, seen_things(scene, probe))
@@ -215,4 +218,5 @@ def _part_of(scene: Scene, prims: frozenset[str]) -> Scene:
         scene,
         meshes=tuple(mesh for mesh in scene.meshes if prim_of(mesh.path) in prims),
         spheres=tuple(ball for ball in scene.spheres if prim_of(ball.path) in prims),
+        instances=tuple(some for many in scene.instances if len(some := within(many, prims))),
     )

@@ -20,6 +20,7 @@ from ..settings import RenderSettings
 from ..world import environment, textures
 from ..world.embree import Bvh
 from ..world.emitters import what_glows
+from ..world.instances import settled
 from ..world.lamps import pack_lights
 from ..world.tables import (
     Geometry,
@@ -231,7 +232,8 @@ def _geometry_source(scene: Scene, chosen: Plan) -> Any:
     """All that `pack_geometry` reads."""
     kinds = tuple((material.refractive, material.cutout) for material in scene.materials)
     slots = primvar_slots(scene.materials)
-    return scene.meshes, scene.spheres, kinds, slots, tuple(chosen.captured_sets), tuple(caster_sets(scene))
+    things = scene.meshes, scene.spheres, scene.instances
+    return things, kinds, slots, tuple(chosen.captured_sets), tuple(caster_sets(scene))
 
 
 def _paste(table: ProbeTable, k: int, alone: ProbeTable) -> None:
@@ -272,6 +274,7 @@ def capture_probes(
     for probe in probes:
         if probe.planar:
             raise UsageError(f"{probe.path}: a planar probe's picture depends on the camera; leave it to the render")
+    scene = settled(scene)
     with working(executor, jobs, progress, cancel) as work:
         chosen = plan_capture(scene, [replace(probe, cubemap=None) for probe in probes])
         ready = _prepare(scene, choose_camera(scene, ""), chosen, RenderSettings(), True, samples, work, (0.0, 1.0))

@@ -16,7 +16,7 @@ from ..kernels.compile import inlined
 from ..kernels.lanes import put
 from ..kernels.sampling import hash32
 from ..kernels.vec import Vec, flip_towards, mul, row, scale
-from ..world.surface import NOTHING, HitLanes, Interaction, Ray, interaction, keep_hit, kept_hit
+from ..world.surface import NOTHING, HitLanes, Interaction, Ray, interaction, keep_hit, kept_hit, surface_of
 from ..world.tables import World
 from .rays import THROUGH_SIDE, VIEW, Rays
 from .tiers import Query
@@ -98,7 +98,8 @@ def add_answer(answers: Answers, slot: int, leaves: Rays, k: int, query: Query, 
     keep_hit(answers.hits, r, hit)
     d = row(leaves.direction, k)
     sharp = query.blur[lane] <= 0.0  # the ray in the middle of a cone says nothing about the rest of it
-    answers.way[r] = np.int32(hash32(leaves.way[k], hit.part if sharp else NOTHING, 0))
+    what = surface_of(world.geometry, hit) if sharp and hit.part != NOTHING else NOTHING
+    answers.way[r] = np.int32(hash32(leaves.way[k], what, 0))
     answers.side[r] = max(THROUGH_SIDE, leaves.side[k])  # what an eye in glass sees has come through, too
     put(answers.weight, r, row(leaves.weight, k))
     put(answers.direction, r, d)
@@ -140,14 +141,15 @@ def add_glow(answers: Answers, slot: int, light: Vec, side: int, way: int, what:
 
 @inlined
 def add_direct(
-    answers: Answers, slot: int, at: Interaction, direction: Vec, emissive: Vec, albedo: Vec, irradiance: Vec,
-    rest: Vec, wide: float,
+    answers: Answers, slot: int, world: World, at: Interaction, direction: Vec, emissive: Vec, albedo: Vec,
+    irradiance: Vec, rest: Vec, wide: float,
 ) -> None:  # fmt: skip
     """Keep an opaque surface that a view ray sees."""
     answers.filled[slot] = 1
     r = slot * MOST_ANSWERS
     keep_hit(answers.hits, r, at.hit)
-    answers.way[r], answers.side[r], answers.share[r], answers.wide[r] = at.hit.part, VIEW, 1.0, wide
+    answers.way[r], answers.side[r] = surface_of(world.geometry, at.hit), VIEW
+    answers.share[r], answers.wide[r] = 1.0, wide
     put(answers.weight, r, (1.0, 1.0, 1.0))
     put(answers.point, r, at.point)
     put(answers.direction, r, direction)

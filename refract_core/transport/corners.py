@@ -24,7 +24,7 @@ from ..view.gbuffer import OpaqueLayer, add_view_ray
 from ..view.planes import Planes
 from ..world.embree import COHERENT, EVERYTHING, clear, has_hit
 from ..world.shading import entering, is_painted_alone, load_surface, paint
-from ..world.surface import NOTHING, Hit, Interaction, Ray, corners_of, hit_in, interaction, kept_hit
+from ..world.surface import NOTHING, Hit, Interaction, Ray, corners_of, hit_in, interaction, kept_hit, surface_of
 from ..world.tables import World
 from ..world.tracing import intersect_world
 from .answers import MOST_ANSWERS, Answers, add_direct, add_sky, body_light, keep_answers
@@ -83,7 +83,7 @@ class CornerScratch(NamedTuple):
     """What one thread needs besides a tree's."""
 
     middle: I32_1D
-    """part that is seen in the middle of each pixel of the patch; NOTHING where there is none"""
+    """surface that is seen in the middle of each pixel of the patch; NOTHING where there is none"""
     edges: I32_1D
     """pixels of the patch that are edges"""
     sets: I32_1D
@@ -218,7 +218,7 @@ def _keep_opaque(
     put(cell.color, slot, light)
     cell.missing[slot] = 1.0 - opaque.color[y, x, 3]
     cell.chance[slot] = opaque.hits.chance[y, x]
-    cell.part[slot] = NOTHING if opaque.depth[y, x] == math.inf else opaque.hits.part[y, x]
+    cell.part[slot] = NOTHING
     cell.z_depth[slot] = opaque.depth[y, x]
     put(cell.normal, slot, row(opaque.normal[y], x))
     if opaque.depth[y, x] == math.inf:
@@ -230,10 +230,11 @@ def _keep_opaque(
         hits.part[y, x], hits.primitive[y, x], hits.instance[y, x], hits.material[y, x],
         np.float64(hits.u[y, x]), np.float64(hits.v[y, x]), t,
     )  # fmt: skip
+    cell.part[slot] = surface_of(world.geometry, hit)
     at = interaction(world.geometry, hit, Ray(origin, direction), view.spread * t)
     emissive, albedo = row(hits.emissive[y], x), row(hits.albedo[y], x)
     irradiance, gloss = row(opaque.irradiance[y], x), row(opaque.gloss[y], x)
-    add_direct(scratch.answers, slot, at, direction, emissive, albedo, irradiance, gloss, view.spread * t)
+    add_direct(scratch.answers, slot, world, at, direction, emissive, albedo, irradiance, gloss, view.spread * t)
 
 
 @inlined
@@ -254,7 +255,7 @@ def _look_in_middles(
             for lane in range(LANES):
                 if has_hit(packet, lane):
                     i, j = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
-                    own.middle[j * PATCH + i] = hit_in(packet, lane, world.geometry).part
+                    own.middle[j * PATCH + i] = surface_of(world.geometry, hit_in(packet, lane, world.geometry))
 
 
 @inlined
@@ -448,7 +449,7 @@ def _filter(scratch: TreeScratch, own: CornerScratch, world: World) -> None:
 @inlined
 def _moved(world: World, hit: Hit, off: Vec) -> Hit:
     """The place beside a hit, in the plane of its triangle: so a texture goes on beyond the triangle's border."""
-    a, b, c = corners_of(world.geometry, hit.part, hit.primitive)
+    a, b, c = corners_of(world.geometry, hit.part, hit.instance, hit.primitive)
     x, y = sub(b, a), sub(c, a)
     xx, xy, yy = dot(x, x), dot(x, y), dot(y, y)
     area = xx * yy - xy * xy

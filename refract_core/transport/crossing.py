@@ -20,7 +20,7 @@ from ..optics.interface import fresnel_dielectric, reflect, refract, transmittan
 from ..optics.models import absorption_distance_of, exit_of, is_sheet, is_walked, thickness_of
 from ..scene import Param
 from ..world.offsets import off_surface, past
-from ..world.surface import Interaction, color_input, drawn_model, float_input, normal_input, share_input
+from ..world.surface import Interaction, color_input, drawn_model, float_input, normal_input, share_input, thing_of
 from ..world.tables import World
 from .rays import (
     AIR,
@@ -125,7 +125,7 @@ def meet(meeting: Meeting, lane: int, now: Rays, at: Interaction, world: World) 
     """Say what the glass at a hit is to a ray, and look up its attributes. Bodies that fill no space are noted, and the
     way to the hit is absorbed along."""
     geometry, materials, hit, media = world.geometry, world.materials, at.hit, now.media
-    m, thing = hit.material, geometry.thing[hit.part]
+    m, thing = hit.material, thing_of(geometry, hit)
     model, open_mesh = drawn_model(world, hit), geometry.sheet[hit.part] != 0
     outer = dot(at.ng, row(now.direction, lane)) < 0.0
     slot = slot_of(media, lane, thing)

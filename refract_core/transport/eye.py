@@ -8,6 +8,8 @@ import numpy as np
 
 from ..models import BY_TOKEN, Behind
 from ..scene import Camera, Material, Param, Scene
+from ..world.instances import around as around_places
+from ..world.instances import placed
 from ..world.solid import encloses
 from .rays import MOST_MEDIA, Rays, add_medium, ray_in_air
 
@@ -36,6 +38,15 @@ def view_ray(scene: Scene, camera: Camera, model: str) -> Rays:
     for k, ball in enumerate(scene.spheres):
         if traced[ball.material] and math.dist(ball.centre, eye) < ball.radius:
             around.append(((2.0 * ball.radius) ** 3, len(scene.meshes) + k, scene.materials[ball.material]))
+    first = len(scene.meshes) + len(scene.spheres)
+    for many in scene.instances:
+        of_glass = traced[many.mesh.materials]
+        if many.mesh.closed and of_glass.any():
+            filled_with = scene.materials[many.mesh.materials[of_glass.argmax()]]
+            for k in around_places(many, eye):
+                size = float(np.prod(np.ptp(placed(many, k).points, axis=0)))
+                around.append((size, first + k, filled_with))
+        first += len(many)
     for _, thing, material in sorted(around, key=lambda body: -body[0])[-MOST_MEDIA:]:
         r, g, b = (float(c) for c in material.inputs[Param.TRANSMITTANCE].value[:3])
         ior = max(1.0, float(material.inputs[Param.IOR].value[0]))

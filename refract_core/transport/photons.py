@@ -30,7 +30,7 @@ from ..world.environment import TEXEL_LUMINANCE, direction_pdf, irradiance, radi
 from ..world.lights import drawn_ray, irradiance_factor, is_flat
 from ..world.offsets import off_surface
 from ..world.shaping import shape_drawn, shape_matt
-from ..world.surface import NOTHING, Interaction, Ray, corners_of, interaction, kept_hit
+from ..world.surface import NOTHING, Interaction, Ray, corners_of, interaction, kept_hit, sense_of
 from ..world.tables import World
 from ..world.tracing import add_shadow_ray, visible
 from .crossing import PASSED, Rules, meet, send_mirrored, send_out, send_past, send_through
@@ -50,6 +50,8 @@ class Sources(NamedTuple):
     light: I32_1D
     """shape (E,): row of the light table; one more than the last is the sky"""
     part: I32_1D
+    instance: I32_1D
+    """which of the part's places"""
     primitive: I32_1D
     """triangle within the part; patch of a sphere"""
     side: F64_1D
@@ -137,7 +139,8 @@ def _place_at(world: World, sources: Sources, e: int, a: float, b: float) -> tup
         r = math.sqrt(max(0.0, 1.0 - z * z))
         n = (r * math.cos(phi), r * math.sin(phi), z)
         return add(row(geometry.sphere, part), scale(n, np.float64(geometry.sphere[part, 3]))), scale(n, side)
-    p, q, last = corners_of(geometry, part, sources.primitive[e])
+    p, q, last = corners_of(geometry, part, sources.instance[e], sources.primitive[e])
+    side *= sense_of(geometry, part, sources.instance[e])
     pq, pr = sub(q, p), sub(last, p)
     return add(p, add(scale(pq, a), scale(pr, b))), scale(normalize(cross(pq, pr)), side)
 

@@ -26,7 +26,7 @@ from ..world.lights import lamp_ahead
 from ..world.offsets import tie
 from ..world.shading import LOBES, Block, gather, load_surface
 from ..world.shaping import shape_drawn
-from ..world.surface import NOTHING, Hit, HitLanes, Ray, hit_in, interaction, keep_hit, kept_hit
+from ..world.surface import NOTHING, Hit, HitLanes, Ray, hit_in, interaction, keep_hit, kept_hit, surface_of
 from ..world.tables import World
 from ..world.tracing import belongs_to, intersect_world
 from .answers import Answers, add_answer, add_glow, new_answers
@@ -325,7 +325,7 @@ def _meet_all(scratch: TreeScratch, world: World, view: View, rules: Rules, take
         first = now.side[lane] == VIEW
         direction = row(now.direction, lane)
         if first and now.met[lane] == 0:  # even what it passes: the ray to the pixel's middle sees that, too
-            cell.part[now.pixel[lane]] = hit.part
+            cell.part[now.pixel[lane]] = surface_of(world.geometry, hit)
         wide = cell.spread[now.pixel[lane]] * (now.travelled[lane] + hit.t)
         at = interaction(world.geometry, hit, Ray(row(now.origin, lane), direction), wide)
         meet(meeting, lane, now, at, world)
@@ -376,7 +376,7 @@ def _note_opaque(scratch: TreeScratch, world: World, view: View, lane: int) -> N
     now, hit = scratch.now, kept_hit(scratch.met, lane)
     direction, i = row(now.direction, lane), now.pixel[lane]
     if now.met[lane] == 0:
-        scratch.cell.part[i] = hit.part
+        scratch.cell.part[i] = surface_of(world.geometry, hit)
     scratch.cell.z_depth[i] = hit.t * dot(direction, row(view.axes, 2))
     at = interaction(world.geometry, hit, Ray(row(now.origin, lane), direction), 0.0)
     put(scratch.cell.normal, i, flip_towards(at.ng, scale(direction, -1.0)))

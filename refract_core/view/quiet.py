@@ -40,7 +40,7 @@ from ..world.shading import (
     share_of_lamp,
     share_of_sky,
 )
-from ..world.surface import hit_in
+from ..world.surface import hit_in, surface_of
 from ..world.tables import World
 from ..world.tracing import belongs_to, intersect_world, lamp_visible, visible
 from .camera import Tile, View
@@ -73,7 +73,7 @@ class QuietScratch(NamedTuple):
     places: Block
     """N rows: their surfaces, and the light that has been found for them"""
     part: I32_1D
-    """shape (N,): Embree geometry; -1 where there is nothing"""
+    """shape (N,): as `surface.surface_of`; -1 where there is nothing"""
     arrives: F64_1D
     """shape (N,): irradiance from the lamps, as the sum of its colours"""
     possible: F64_1D
@@ -190,7 +190,7 @@ def _look(
                 copy_lane(places, i, block, lane)
                 forget_light(places, i)
                 scratch.possible[i] = scratch.arrives[i] = 0.0
-                scratch.part[i] = hit_in(packet, lane, world.geometry).part
+                scratch.part[i] = surface_of(world.geometry, hit_in(packet, lane, world.geometry))
     return glass
 
 

@@ -3,6 +3,6 @@ that leaves an opaque hit. And what closed meshes enclose.
 """
 
 __all__ = [
-    "bounced", "caustics", "embree", "emitters", "environment", "gathering", "glow", "lamps", "lights", "offsets",
-    "shading", "shaping", "solid", "surface", "tables", "textures", "tracing",
+    "bounced", "caustics", "embree", "emitters", "environment", "gathering", "glow", "instances", "lamps", "lights",
+    "offsets", "shading", "shaping", "solid", "surface", "tables", "textures", "tracing",
 ]  # fmt: skip

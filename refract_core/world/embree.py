@@ -45,10 +45,11 @@ SCATTERED = flag(False)
 
 _INVALID = -1  # RTC_INVALID_GEOMETRY_ID as int32
 _COHERENT_FLAG = 1 << 16  # RTC_RAY_QUERY_FLAG_COHERENT
-_TRIANGLE, _SPHERE_POINT = 0, 50  # RTCGeometryType
-_INDEX, _VERTEX = 0, 1  # RTCBufferType
-_UINT3, _FLOAT3, _FLOAT4 = 0x5003, 0x9003, 0x9004  # RTCFormat
+_TRIANGLE, _SPHERE_POINT, _INSTANCE_ARRAY = 0, 50, 122  # RTCGeometryType
+_INDEX, _VERTEX, _TRANSFORM = 0, 1, 23  # RTCBufferType
+_UINT3, _FLOAT3, _FLOAT4, _FLOAT3X4 = 0x5003, 0x9003, 0x9004, 0x9134  # RTCFormat; the last row by row
 _ROBUST = 1 << 2  # RTC_SCENE_FLAG_ROBUST
+_SOME = 1 << 16  # transforms that are looked at together
 
 # Rows of RTCRayHit8 (each row is one 32-bit word for eight lanes).
 ORG_X, ORG_Y, ORG_Z, T_NEAR, DIR_X, DIR_Y, DIR_Z, TIME, T_FAR, MASK, RAY_ID, FLAGS = range(12)
@@ -87,6 +88,7 @@ def library() -> ctypes.CDLL:
         "rtcNewGeometry": (handle, [handle, ctypes.c_int]),
         "rtcSetSharedGeometryBuffer": (None, [handle, ctypes.c_int, flag, ctypes.c_int, handle, size, size, size]),
         "rtcSetGeometryMask": (None, [handle, flag]),
+        "rtcSetGeometryInstancedScene": (None, [handle, handle]),
         "rtcCommitGeometry": (None, [handle]),
         "rtcAttachGeometryByID": (None, [handle, handle, flag]),
         "rtcReleaseGeometry": (None, [handle]),
@@ -102,13 +104,16 @@ def library() -> ctypes.CDLL:
 
 
 class Part(NamedTuple):
-    """One Embree geometry: a run of triangles, or one exact sphere."""
+    """One Embree geometry: a run of triangles, in one place or in many, or one exact sphere."""
 
     mask: int
     triangles: NDArray[np.uint32] | None
-    """shape (T, 3), indices into the points given to `build`; None for a sphere."""
+    """shape (T, 3), indices into the points given to `build`; None for a sphere. Parts with transforms that have the
+    same array share its hierarchy"""
     sphere: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """centre, radius [m]"""
+    transforms: NDArray[np.float32] | None = None
+    """shape (N, 3, 4): the places of the triangles, whose points are in a frame of their own; None: where they are"""
 
 
 class Bvh:
@@ -131,38 +136,67 @@ class Bvh:
         # Embree may read 16 bytes at the last vertex.
         self._points = np.zeros((len(points) + 2, 3), np.float32)
         self._points[: len(points)] = points
-        self._parts = [
-            np.ascontiguousarray(p.triangles, np.uint32)
-            if p.triangles is not None
-            else np.array([p.sphere], np.float32)
-            for p in parts
-        ]
+        self._buffers: list[NDArray[Any]] = []
+        shared: dict[int, int] = {}
         device = lib.rtcNewDevice(None)
         if not device:
             raise EmbreeError(f"Embree cannot start on this machine (error {lib.rtcGetDeviceError(None)})")
         scene = lib.rtcNewScene(device)
         self._free = weakref.finalize(self, _release, lib, scene, device)
         lib.rtcSetSceneFlags(scene, _ROBUST)
-        for identifier, (part, array) in enumerate(zip(parts, self._parts, strict=True)):
-            self._attach(lib, device, scene, identifier, part, array)
+        for identifier, part in enumerate(parts):
+            if part.transforms is None:
+                self._attach(lib, scene, identifier, self._geometry(lib, device, part), part.mask)
+                continue
+            if id(part.triangles) not in shared:
+                shared[id(part.triangles)] = self._apart(lib, device, part)
+            places = self._places(lib, device, part.transforms, shared[id(part.triangles)])
+            self._attach(lib, scene, identifier, places, part.mask)
+        for inner in shared.values():  # what stands in it keeps it
+            lib.rtcReleaseScene(inner)
         lib.rtcCommitScene(scene)
         if error := lib.rtcGetDeviceError(device):
             raise EmbreeError(f"Embree failed to build the scene (error {error}; 4 means out of memory)")
         self.handle = int(scene)
         """Address of the RTCScene, for kernels."""
 
-    def _attach(
-        self, lib: ctypes.CDLL, device: int, scene: int, identifier: int, part: Part, array: NDArray[Any]
-    ) -> None:
+    def _kept(self, array: NDArray[Any]) -> int:
+        """Address of what Embree reads as long as this lives."""
+        self._buffers.append(array)
+        return int(array.ctypes.data)
+
+    def _geometry(self, lib: ctypes.CDLL, device: int, part: Part) -> int:
+        """Triangles where their points are, or a sphere."""
         if part.triangles is not None:
             geometry = lib.rtcNewGeometry(device, _TRIANGLE)
             pool, count = self._points, len(self._points) - 2
+            array = np.ascontiguousarray(part.triangles, np.uint32)
             lib.rtcSetSharedGeometryBuffer(geometry, _VERTEX, 0, _FLOAT3, pool.ctypes.data, 0, 12, count)
-            lib.rtcSetSharedGeometryBuffer(geometry, _INDEX, 0, _UINT3, array.ctypes.data, 0, 12, len(array))
+            lib.rtcSetSharedGeometryBuffer(geometry, _INDEX, 0, _UINT3, self._kept(array), 0, 12, len(array))
         else:
             geometry = lib.rtcNewGeometry(device, _SPHERE_POINT)
-            lib.rtcSetSharedGeometryBuffer(geometry, _VERTEX, 0, _FLOAT4, array.ctypes.data, 0, 16, 1)
-        lib.rtcSetGeometryMask(geometry, int(part.mask) & 0xFFFFFFFF)
+            ball = np.array([part.sphere], np.float32)
+            lib.rtcSetSharedGeometryBuffer(geometry, _VERTEX, 0, _FLOAT4, self._kept(ball), 0, 16, 1)
+        return int(geometry)
+
+    def _apart(self, lib: ctypes.CDLL, device: int, part: Part) -> int:
+        """A scene of triangles alone. It hides nothing from any ray: the mask is for each of its places to have."""
+        inner = lib.rtcNewScene(device)
+        lib.rtcSetSceneFlags(inner, _ROBUST)
+        self._attach(lib, inner, 0, self._geometry(lib, device, part), int(EVERYTHING))
+        lib.rtcCommitScene(inner)
+        return int(inner)
+
+    def _places(self, lib: ctypes.CDLL, device: int, transforms: NDArray[np.float32], inner: int) -> int:
+        geometry = lib.rtcNewGeometry(device, _INSTANCE_ARRAY)
+        lib.rtcSetGeometryInstancedScene(geometry, inner)
+        array = np.ascontiguousarray(transforms, np.float32)
+        lib.rtcSetSharedGeometryBuffer(geometry, _TRANSFORM, 0, _FLOAT3X4, self._kept(array), 0, 48, len(array))
+        return int(geometry)
+
+    def _attach(self, lib: ctypes.CDLL, scene: int, identifier: int, geometry: int, mask: int) -> None:
+        """Gives a geometry away to a scene."""
+        lib.rtcSetGeometryMask(geometry, int(mask) & 0xFFFFFFFF)
         lib.rtcCommitGeometry(geometry)
         lib.rtcAttachGeometryByID(scene, geometry, identifier)
         lib.rtcReleaseGeometry(geometry)
@@ -193,6 +227,24 @@ def check_parts(points: NDArray[np.float32], parts: list[Part]) -> None:
             raise SceneError(f"part {i}: triangles must be integers of shape (T, 3), not {t.dtype} {t.shape}")
         elif t.size and (int(t.max()) >= len(points) or int(t.min()) < 0):
             raise SceneError(f"part {i}: a triangle index is outside 0 .. {len(points) - 1}")
+        if part.transforms is not None:
+            try:
+                check_transforms(part.transforms)
+            except SceneError as error:
+                raise SceneError(f"part {i}: {error}") from None
+
+
+def check_transforms(transforms: NDArray[np.float32]) -> None:
+    """Refuse places that are none, or leave nothing of a body. Raises SceneError."""
+    if transforms.ndim != 3 or transforms.shape[1:] != (3, 4) or transforms.dtype != np.float32:
+        raise SceneError(f"transforms must be float32 of shape (N, 3, 4), not {transforms.dtype} {transforms.shape}")
+    for start in range(0, len(transforms), _SOME):
+        some = transforms[start : start + _SOME]
+        linear = some[:, :, :3].astype(np.float64)
+        volume = (linear[:, 0] * np.cross(linear[:, 1], linear[:, 2])).sum(axis=1)
+        bad = np.flatnonzero(~np.isfinite(some).all(axis=(1, 2)) | ~(np.abs(volume) > 0.0))
+        if len(bad):
+            raise SceneError(f"transform {start + bad[0]} is not finite, or flattens: {some[bad[0]].tolist()}")
 
 
 class Packet(NamedTuple):

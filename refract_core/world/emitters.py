@@ -68,7 +68,8 @@ def what_glows(world: World, scene: Scene, eye: F64) -> Glow | None:
         return None
     seen, exact = by_address(world), world.geometry.sphere[:, 3] > 0.0
     objects: dict[int, list[_Pieces]] = {}
-    parts = [part for part in range(len(exact)) if emits[world.geometry.material[rows_of(world.geometry, part)]].any()]
+    alone = np.flatnonzero(world.geometry.place < 0).tolist()  # what glows in many places is settled to be alone
+    parts = [part for part in alone if emits[world.geometry.material[rows_of(world.geometry, part)]].any()]
     few = exact[parts].sum() <= _MOST_LIGHTS
     balls: list[Light] = []
     for part in parts:
@@ -97,14 +98,14 @@ def emission_of(
 ) -> None:
     """Fill the mean radiance of pieces, of what of them is there."""
     for e in range(part.shape[0]):
-        a, b, c = corners_of(world.geometry, part[e], primitive[e])
+        a, b, c = corners_of(world.geometry, part[e], 0, primitive[e])
         wide = math.sqrt(0.5 * length(cross(sub(b, a), sub(c, a))) * abs(_share_of(bary, e)))
         total = (0.0, 0.0, 0.0)
         material = world.geometry.material[world.geometry.first[part[e]] + primitive[e]]
         for s, t in _PLACES:
             u = bary[e, 0, 0] + s * (bary[e, 1, 0] - bary[e, 0, 0]) + t * (bary[e, 2, 0] - bary[e, 0, 0])
             v = bary[e, 0, 1] + s * (bary[e, 1, 1] - bary[e, 0, 1]) + t * (bary[e, 2, 1] - bary[e, 0, 1])
-            hit = Hit(part[e], primitive[e], -1, material, u, v, 1.0)
+            hit = Hit(part[e], primitive[e], 0, material, u, v, 1.0)
             at = interaction(world.geometry, hit, Ray((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), wide)
             light = color_input(world, at, Param.EMISSIVE.value)
             total = along(total, (max(0.0, light[0]), max(0.0, light[1]), max(0.0, light[2])), 0.25 * _there(world, at))

@@ -7,9 +7,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene import F32, Light, LightKind, Scene, Shaping, prim_of
+from ..scene import F32, Light, LightKind, Scene, Shaping
 from .embree import CASTER_SHIFTS
 from .glow import Glow, no_glow
+from .instances import paths_of, thing_count
 from .lights import KINDS, LightTable, ShapeTable
 from .tables import caster_sets
 
@@ -59,8 +60,9 @@ def _linked(scene: Scene, groups: list[tuple[str, ...]]) -> NDArray[np.uint8]:
     """`LightTable.linked` for groups of paths."""
     if not groups:
         return np.zeros((0, 0), np.uint8)
-    paths = [prim_of(mesh.path) for mesh in scene.meshes] + [prim_of(ball.path) for ball in scene.spheres]
-    return np.array([[path in group for path in paths] for group in map(frozenset, groups)], np.uint8)
+    owners, counts = zip(*paths_of(scene), strict=True) if thing_count(scene) else ((), ())
+    lit = [[owner in group for owner in owners] for group in map(frozenset, groups)]
+    return np.repeat(np.array(lit, np.uint8).reshape(len(groups), len(owners)), np.array(counts, np.int64), axis=1)
 
 
 def _size_factor(kind: LightKind) -> tuple[float, float]:

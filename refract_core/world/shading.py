@@ -26,7 +26,7 @@ from .environment import TEXEL_LUMINANCE, EnvironmentTable, direction_pdf, irrad
 from .lights import LightTable, highlight, irradiance_factor, shadow_ray
 from .offsets import off_surface
 from .shaping import shape_matt, shape_mirrored
-from .surface import Interaction, color_input, float_input, hit_in, interaction, normal_input, share_input
+from .surface import Interaction, color_input, float_input, hit_in, interaction, normal_input, share_input, thing_of
 from .tables import World
 from .tracing import add_shadow_ray, intersect_world, lamp_visible, ray_of, visible
 
@@ -165,7 +165,7 @@ def load_surface(block: Block, lane: int, at: Interaction, world: World, wo: Vec
         f0 = lerp((dielectric, dielectric, dielectric), base, metallic)
     roughness = share_input(world, at, Param.ROUGHNESS.value)
     diffuse = mul(scale(base, 1.0 - metallic), _entering(f0, roughness, abs(dot(ns, wo))))
-    block.thing[lane] = world.geometry.thing[at.hit.part]
+    block.thing[lane] = thing_of(world.geometry, at.hit)
     put(block.point, lane, at.point)
     put(block.ng, lane, ng)
     put(block.ns, lane, ns)

@@ -7,12 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..kernels.arrays import F32_2D
 from ..kernels.compile import inlined
 from ..kernels.lanes import Scalars, Words
 from ..kernels.vec import Vec, add, along, cross, dot, flip_towards, length, normalize, row, scale, sub
 from ..optics.models import on_open_mesh
 from ..scene import Channel, Param
-from .embree import GEOM, HIT_U, HIT_V, INST, PRIM, Packet, hit_distance
+from .embree import GEOM, HIT_U, HIT_V, INST, INST_PRIM, PRIM, Packet, hit_distance
 from .tables import Geometry, World
 from .textures import Rgba, sample
 
@@ -32,11 +33,11 @@ class Hit(NamedTuple):
     """Where a ray met a surface: all that Embree tells, and the material, looked up once. Outlives the packet."""
 
     part: int
-    """Embree geometry; `NOTHING` where nothing was met"""
+    """as `Geometry` numbers them; `NOTHING` where nothing was met"""
     primitive: int
     """triangle within the part"""
     instance: int
-    """Embree instance; -1 for what is not instanced"""
+    """which of the part's places; 0 where it has one"""
     material: int
     u: float
     """barycentric weight of the triangle's second corner"""
@@ -79,11 +80,15 @@ class Interaction(NamedTuple):
 def hit_in(packet: Packet, lane: int, geometry: Geometry) -> Hit:
     """The hit in a lane of a traced packet; the lane must have one (`embree.has_hit`)."""
     rays, words = packet.rays, packet.words
-    part, primitive = words[GEOM, lane], words[PRIM, lane]
+    part, primitive, instance = words[GEOM, lane], words[PRIM, lane], words[INST_PRIM, lane]
+    if words[INST, lane] >= 0:  # what stands in many places has a scene of its own, whose only geometry is 0
+        part = words[INST, lane]
+    else:
+        instance &= 0
     return Hit(
         part,
         primitive,
-        words[INST, lane],
+        instance,
         geometry.material[geometry.first[part] + primitive],
         np.float64(rays[HIT_U, lane]),
         np.float64(rays[HIT_V, lane]),
@@ -109,13 +114,63 @@ def kept_hit(hits: HitLanes, lane: int) -> Hit:
 
 
 @inlined
-def corners_of(geometry: Geometry, part: int, primitive: int) -> tuple[Vec, Vec, Vec]:
-    """The three corners of a triangle [m]."""
+def thing_of(geometry: Geometry, hit: Hit) -> int:
+    """Number of the thing that was hit: a prim, or one of its instances."""
+    return geometry.thing[hit.part] + hit.instance
+
+
+@inlined
+def surface_of(geometry: Geometry, hit: Hit) -> int:
+    """Number of the surface that was hit: a part, in one of its places."""
+    return geometry.surface[hit.part] + hit.instance
+
+
+@inlined
+def corners_of(geometry: Geometry, part: int, instance: int, primitive: int) -> tuple[Vec, Vec, Vec]:
+    """The three corners of a triangle [m], in the order of the mesh: clockwise from outside where the place mirrors."""
     t = geometry.first[part] + primitive
     a = row(geometry.points, geometry.triangles[t, 0])
     b = row(geometry.points, geometry.triangles[t, 1])
     c = row(geometry.points, geometry.triangles[t, 2])
+    if geometry.place[part] >= 0:
+        at = geometry.transforms[geometry.place[part] + instance]
+        return _moved(at, a), _moved(at, b), _moved(at, c)
     return a, b, c
+
+
+@inlined
+def sense_of(geometry: Geometry, part: int, instance: int) -> float:
+    """-1 where the place of a part mirrors it, else 1."""
+    k = geometry.place[part]
+    if k < 0:
+        return 1.0
+    at = geometry.transforms[k + instance]
+    return -1.0 if dot(_linear(at, 0), cross(_linear(at, 1), _linear(at, 2))) < 0.0 else 1.0
+
+
+@inlined
+def _linear(at: F32_2D, r: int) -> Vec:
+    """A row of the linear part of a transform."""
+    return (np.float64(at[r, 0]), np.float64(at[r, 1]), np.float64(at[r, 2]))
+
+
+@inlined
+def _moved(at: F32_2D, p: Vec) -> Vec:
+    """A point of the mesh, where a transform takes it [m]."""
+    return (
+        dot(_linear(at, 0), p) + at[0, 3],
+        dot(_linear(at, 1), p) + at[1, 3],
+        dot(_linear(at, 2), p) + at[2, 3],
+    )
+
+
+@inlined
+def _turned(at: F32_2D, n: Vec) -> Vec:
+    """A normal of the mesh, where a transform takes it, by the inverse transpose; of any length."""
+    x, y, z = _linear(at, 0), _linear(at, 1), _linear(at, 2)
+    across = cross(y, z)
+    sense = -1.0 if dot(x, across) < 0.0 else 1.0
+    return (sense * dot(across, n), sense * dot(cross(z, x), n), sense * dot(cross(x, y), n))
 
 
 @inlined
@@ -139,9 +194,12 @@ def interaction(geometry: Geometry, hit: Hit, ray: Ray, footprint: float) -> Int
         point = along(centre, ng, np.float64(geometry.sphere[part, 3]))
         ns = ng
     else:
-        a, b, c = corners_of(geometry, part, hit.primitive)
+        a, b, c = corners_of(geometry, part, hit.instance, hit.primitive)
         ab, ac = sub(b, a), sub(c, a)
         ng = normalize(cross(ab, ac))
+        place = geometry.place[part]
+        if place >= 0:
+            ng = scale(ng, sense_of(geometry, part, hit.instance))
         point = (
             a[0] + u * ab[0] + v * ac[0],
             a[1] + u * ab[1] + v * ac[1],
@@ -152,13 +210,20 @@ def interaction(geometry: Geometry, hit: Hit, ray: Ray, footprint: float) -> Int
         if k >= 0:
             n = geometry.normals[k + hit.primitive]
             w = 1.0 - u - v
-            ns = normalize(
-                (
-                    w * n[0, 0] + u * n[1, 0] + v * n[2, 0],
-                    w * n[0, 1] + u * n[1, 1] + v * n[2, 1],
-                    w * n[0, 2] + u * n[1, 2] + v * n[2, 2],
+            if place >= 0:  # each corner's first, and of length 1, as of a mesh that stands there
+                at = geometry.transforms[place + hit.instance]
+                n0 = normalize(_turned(at, row(n, 0)))
+                n1 = normalize(_turned(at, row(n, 1)))
+                n2 = normalize(_turned(at, row(n, 2)))
+                ns = normalize(along(along(scale(n0, w), n1, u), n2, v))
+            else:
+                ns = normalize(
+                    (
+                        w * n[0, 0] + u * n[1, 0] + v * n[2, 0],
+                        w * n[0, 1] + u * n[1, 1] + v * n[2, 1],
+                        w * n[0, 2] + u * n[1, 2] + v * n[2, 2],
+                    )
                 )
-            )
             if dot(ns, ns) == 0.0:
                 ns = ng
             ns = flip_towards(ns, ng)
@@ -177,7 +242,7 @@ def _primvar2(geometry: Geometry, hit: Hit, slot: int) -> tuple[bool, float, flo
     stride = geometry.primvar_stride[hit.part, slot]
     size = geometry.primvar_size[hit.part, slot]
     p = geometry.primvars
-    k = first + hit.primitive * stride
+    k = first + hit.primitive * stride + hit.instance * geometry.primvar_step[hit.part, slot]
     if stride == 0:
         return True, np.float64(p[k]), np.float64(p[k + 1])
     w = 1.0 - hit.u - hit.v
@@ -195,7 +260,7 @@ def _primvar4(geometry: Geometry, hit: Hit, slot: int) -> tuple[bool, Rgba]:
     stride = geometry.primvar_stride[hit.part, slot]
     size = geometry.primvar_size[hit.part, slot]
     p = geometry.primvars
-    k = first + hit.primitive * stride
+    k = first + hit.primitive * stride + hit.instance * geometry.primvar_step[hit.part, slot]
     b, c = (0, 0) if stride == 0 else (size, 2 * size)
     w = 1.0 - hit.u - hit.v
     x = w * p[k] + hit.u * p[k + b] + hit.v * p[k + c]
@@ -217,7 +282,7 @@ def _uv_density(geometry: Geometry, hit: Hit, slot: int) -> float:
     stride = geometry.primvar_stride[hit.part, slot]
     if stride == 0 or geometry.sphere[hit.part, 3] > 0.0:
         return 0.0
-    a, b, c = corners_of(geometry, hit.part, hit.primitive)
+    a, b, c = corners_of(geometry, hit.part, hit.instance, hit.primitive)
     area = length(cross(sub(b, a), sub(c, a)))
     k = geometry.primvar_first[hit.part, slot] + hit.primitive * stride
     size = geometry.primvar_size[hit.part, slot]
@@ -324,7 +389,7 @@ def normal_input(world: World, at: Interaction) -> Vec:
     stride = geometry.primvar_stride[hit.part, slot]
     if geometry.primvar_first[hit.part, slot] < 0 or stride == 0:
         return at.ns
-    a, b, c = corners_of(geometry, hit.part, hit.primitive)
+    a, b, c = corners_of(geometry, hit.part, hit.instance, hit.primitive)
     k = geometry.primvar_first[hit.part, slot] + hit.primitive * stride
     size = geometry.primvar_size[hit.part, slot]
     p = geometry.primvars
@@ -335,7 +400,8 @@ def normal_input(world: World, at: Interaction) -> Vec:
         return at.ns
     tangent = scale(sub(scale(sub(b, a), t2), scale(sub(c, a), t1)), 1.0 / area)
     tangent = normalize(sub(tangent, scale(at.ns, dot(at.ns, tangent))))
-    bitangent = scale(cross(at.ns, tangent), 1.0 if area > 0.0 else -1.0)
+    hand = area * sense_of(geometry, hit.part, hit.instance)
+    bitangent = scale(cross(at.ns, tangent), 1.0 if hand > 0.0 else -1.0)
     n = color_input(world, at, i)
     mapped = add(add(scale(tangent, n[0]), scale(bitangent, n[1])), scale(at.ns, n[2]))
     if dot(mapped, mapped) == 0.0:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..errors import SceneError
 from ..kernels.arrays import F32_1D, F32_2D, F32_3D, I32_1D, I32_2D, I32_3D, I64_1D, I64_2D, U8_1D, U32_2D
 from ..models import BY_TOKEN
-from ..scene import LightKind, Material, Mesh, Model, Param, Scene, Source, Sphere, prim_of
+from ..scene import Instances, LightKind, Material, Mesh, Model, Param, Scene, Source, Sphere, prim_of
 from . import embree
 from .bounced import Bounced, no_bounced
 from .caustics import Caustics, no_caustics
@@ -27,6 +27,7 @@ from .embree import (
     Part,
 )
 from .environment import EnvironmentTable
+from .instances import bounds_of
 from .lights import LightTable
 from .textures import TextureTable
 
@@ -34,23 +35,33 @@ INPUTS = len(Param)
 
 
 class Geometry(NamedTuple):
-    """Everything hit-able. A *part* is one Embree geometry: the opaque or the refractive triangles of a mesh, or a
-    sphere; its number is Embree's geometry ID. G parts, T primitives, S primvar slots."""
+    """Everything hit-able. A *part* is one Embree geometry: the opaque or the refractive triangles of a mesh, in one
+    place or in many, or a sphere; its number is Embree's geometry ID. G parts, T primitives, S primvar slots."""
 
     handle: int
     """RTCScene"""
     points: F32_2D
-    """shape (V, 3) [m]"""
+    """shape (V, 3) [m]; of a part with many places, in its own frame"""
     triangles: U32_2D
     """shape (T, 3); a sphere has one unused row"""
     material: I32_1D
     """shape (T,)"""
     first: I64_1D
-    """shape (G,): row of a part's first primitive"""
+    """shape (G,): row of a part's first primitive; parts may share theirs"""
+    primitives: I64_1D
+    """shape (G,): primitives of a part"""
+    place: I64_1D
+    """shape (G,): row of the first of its places in `transforms`; -1 for what stands where its points are"""
+    places: I64_1D
+    """shape (G,): in how many it stands"""
+    transforms: F32_3D
+    """shape (P, 3, 4): engine world from a part's own frame"""
     sphere: F32_2D
     """shape (G, 4): centre, radius [m]; radius 0 for triangles"""
     thing: I32_1D
-    """shape (G,): index of the prim, meshes first, then spheres"""
+    """shape (G,): index of the prim, meshes first, then spheres, then instances; a part's further places follow"""
+    surface: I32_1D
+    """shape (G,): number of a part's surface; those of its further places follow"""
     sheet: U8_1D
     """shape (G,): 1 where the surface is open, so that both of its sides face the air"""
     touched: U8_1D
@@ -65,6 +76,8 @@ class Geometry(NamedTuple):
     """shape (G, S): offset into the pool; -1 where the part has no such primvar"""
     primvar_stride: I64_2D
     """shape (G, S): floats from one triangle to the next; 0 where constant"""
+    primvar_step: I64_2D
+    """shape (G, S): floats from one place to the next; 0 where all have the same"""
     primvar_size: I64_2D
     """shape (G, S): floats per value"""
 
@@ -231,37 +244,87 @@ class _Pile:
         self.material: list[NDArray[np.int32]] = []
         self.normals: list[NDArray[np.float32]] = []
         self.primvars: list[NDArray[np.float32]] = []
-        self.rows: list[tuple[int, tuple[float, ...], int, bool, int]] = []
-        self.primvar_rows: list[list[tuple[int, int, int]]] = []
+        self.transforms: list[NDArray[np.float32]] = []
+        self.rows: list[tuple[int, int, int, int, tuple[float, ...], int, int, bool, int]] = []
+        self.primvar_rows: list[list[tuple[int, int, int, int]]] = []
         self.bounds: list[tuple[Any, Any]] = []
         self.point_count = self.triangle_count = self.normal_count = self.primvar_count = 0
+        self.place_count = self.surface_count = 0
+        self.shared: dict[Hashable, Any] = {}
+        """What instances of one mesh have in common, by where its arrays are"""
+
+    def once(self, key: Hashable, make: Callable[[], Any]) -> Any:
+        """What is made from the same is made once. Keys that are addresses hold: the scene outlives the pile."""
+        if key not in self.shared:
+            self.shared[key] = make()
+        return self.shared[key]
+
+    def add_points(self, points: NDArray[np.float32]) -> int:
+        """Number of the first of them."""
+        self.points.append(points)
+        self.point_count += len(points)
+        return self.point_count - len(points)
 
     def add(self, part: Part, material: NDArray[np.int32], thing: int, sheet: bool,
             normals: NDArray[np.float32] | None, primvars: dict[str, NDArray[np.float32]],
-            bounds: tuple[Any, Any]) -> None:  # fmt: skip
+            bounds: tuple[Any, Any], of_places: dict[str, NDArray[np.float32]] | None = None,
+            share: Hashable = None) -> None:  # fmt: skip
+        """One more part. `share`: parts with the same have their triangles and all that is of them in common."""
         self.bounds.append(bounds)
-        first_normal = -1
+        self.parts.append(part)
+
+        def rows() -> tuple[int, int, dict[str, tuple[int, int, int, int]]]:
+            first, first_normal = self._add_triangles(part, material, normals)
+            return first, first_normal, self._add_primvars(primvars)
+
+        first, first_normal, known = rows() if share is None else self.once(share, rows)
+        known = known | self._add_primvars(of_places or {})
+        self.primvar_rows.append([known.get(name, (-1, 0, 0, 0)) for name in self.slots])
+        count = 1 if part.triangles is None else len(part.triangles)
+        place, places = -1, 1
+        if part.transforms is not None:
+            place, places = self._add_places(part.transforms), len(part.transforms)
+        row = first, count, place, places, part.sphere, thing, self.surface_count, sheet, first_normal
+        self.rows.append(row)
+        self.surface_count += places
+
+    def _add_places(self, transforms: NDArray[np.float32]) -> int:
+        """Parts of one mesh have their places in common."""
+
+        def add() -> int:
+            self.transforms.append(transforms)
+            self.place_count += len(transforms)
+            return self.place_count - len(transforms)
+
+        return int(self.once(("places", id(transforms)), add))
+
+    def _add_triangles(
+        self, part: Part, material: NDArray[np.int32], normals: NDArray[np.float32] | None
+    ) -> tuple[int, int]:
+        """Rows at which they, and their normals, begin."""
+        first, first_normal = self.triangle_count, -1
         if normals is not None:
             first_normal = self.normal_count
             self.normals.append(normals)
             self.normal_count += len(normals)
         triangles = part.triangles if part.triangles is not None else np.zeros((1, 3), np.uint32)
-        self.rows.append((self.triangle_count, part.sphere, thing, sheet, first_normal))
-        self.parts.append(part)
         self.triangles.append(triangles)
         self.material.append(material)
         self.triangle_count += len(triangles)
-        found = []
-        for name in self.slots:
-            values = primvars.get(name)
-            if values is None:
-                found.append((-1, 0, 0))
-                continue
-            size = values.shape[2]
-            found.append((self.primvar_count, 0 if values.shape[1] == 1 else 3 * size, size))
-            self.primvars.append(np.ascontiguousarray(values, np.float32).reshape(-1))
-            self.primvar_count += values.size
-        self.primvar_rows.append(found)
+        return first, first_normal
+
+    def _add_primvars(self, primvars: dict[str, NDArray[np.float32]]) -> dict[str, tuple[int, int, int, int]]:
+        """Those that some material reads."""
+        return {name: self._add_primvar(values) for name, values in primvars.items() if name in self.slots}
+
+    def _add_primvar(self, values: NDArray[np.float32]) -> tuple[int, int, int, int]:
+        """First float, stride, step and size. Values are of triangle corners, or (N, D) of places."""
+        first, size = self.primvar_count, values.shape[-1]
+        self.primvars.append(np.ascontiguousarray(values, np.float32).reshape(-1))
+        self.primvar_count += values.size
+        if values.ndim == 2:
+            return first, 0, size, size
+        return first, 0 if values.shape[1] == 1 else 3 * size, 0, size
 
 
 def pack_geometry(
@@ -270,6 +333,7 @@ def pack_geometry(
     """Split meshes into opaque and refractive parts, build the BVH, and lay the rest out for kernels.
 
     Args:
+        scene: whose instances of one mesh all look the same to rays (`instances.settled`).
         captured_sets: prim paths that a restricted ray may see; set k gets mask bit `FIRST_CAPTURED_BIT + k`.
 
     Returns:
@@ -281,38 +345,62 @@ def pack_geometry(
     slots = primvar_slots(scene.materials)
     pile, casters = _Pile(slots), caster_sets(scene)
 
-    def mask(material: int, thing: Mesh | Sphere) -> int:
-        return _mask(scene.materials[material], thing.static, thing.path, captured_sets, casters)
+    def mask(material: int, static: bool, path: str) -> int:
+        return _mask(scene.materials[material], static, path, captured_sets, casters)
+
+    def masks(mesh: Mesh, path: str) -> NDArray[np.int64]:
+        used, which = np.unique(mesh.materials, return_inverse=True)
+        return np.array([mask(m, mesh.static, path) for m in used], np.int64)[which]
 
     for thing, mesh in enumerate(scene.meshes):
         _check_mesh(mesh, len(scene.materials))
-        used, which = np.unique(mesh.materials, return_inverse=True)
-        _add_mesh(pile, mesh, thing, np.array([mask(m, mesh) for m in used], np.int64)[which])
-    for i, ball in enumerate(scene.spheres):
-        _add_sphere(pile, ball, len(scene.meshes) + i, mask(ball.material, ball))
+        _add_mesh(pile, mesh, thing, masks(mesh, mesh.path))
+    thing = len(scene.meshes)
+    for ball in scene.spheres:
+        _add_sphere(pile, ball, thing, mask(ball.material, ball.static, ball.path))
+        thing += 1
+    for many in scene.instances:
+        _check_instances(many, len(scene.materials))
+        told = [masks(many.mesh, owner) for owner in dict.fromkeys(owner for owner, _ in many.paths.owners())]
+        if any((other != told[0]).any() for other in told[1:]):
+            raise SceneError(f"{many.mesh.path}: some rays see some of its instances alone; settle the scene first")
+        if len(many):
+            _add_instances(pile, many, thing, told[0])
+        thing += len(many)
     points = np.concatenate(pile.points) if pile.points else np.zeros((0, 3), np.float32)
     bvh = Bvh(points, pile.parts)
-    columns: list[Any] = list(zip(*pile.rows, strict=True)) or [(), (), (), (), ()]
-    first, sphere, thing_of, sheet, first_normal = columns
-    primvar_rows = np.array(pile.primvar_rows, np.int64).reshape(len(pile.rows), len(slots), 3)
+    columns: list[Any] = list(zip(*pile.rows, strict=True)) or [()] * 9
+    first, count, place, places, sphere, thing_of, surface, sheet, first_normal = columns
+    primvar_rows = np.array(pile.primvar_rows, np.int64).reshape(len(pile.rows), len(slots), 4)
     geometry = Geometry(
         handle=bvh.handle,
         points=points,
-        triangles=np.concatenate(pile.triangles) if pile.triangles else np.zeros((0, 3), np.uint32),
+        triangles=_joined(pile.triangles) if pile.triangles else np.zeros((0, 3), np.uint32),
         material=np.concatenate(pile.material) if pile.material else np.zeros(0, np.int32),
         first=np.array(first, np.int64),
+        primitives=np.array(count, np.int64),
+        place=np.array(place, np.int64),
+        places=np.array(places, np.int64),
+        transforms=_joined(pile.transforms) if pile.transforms else np.zeros((0, 3, 4), np.float32),
         sphere=np.array(sphere, np.float32).reshape(-1, 4),
         thing=np.array(thing_of, np.int32),
+        surface=np.array(surface, np.int32),
         sheet=np.array(sheet, np.uint8),
         touched=_touched(pile),
-        normals=np.concatenate(pile.normals) if pile.normals else np.zeros((0, 3, 3), np.float32),
+        normals=_joined(pile.normals) if pile.normals else np.zeros((0, 3, 3), np.float32),
         first_normal=np.array(first_normal, np.int64),
         primvars=np.concatenate(pile.primvars) if pile.primvars else np.zeros(0, np.float32),
         primvar_first=np.ascontiguousarray(primvar_rows[:, :, 0]),
         primvar_stride=np.ascontiguousarray(primvar_rows[:, :, 1]),
-        primvar_size=np.ascontiguousarray(primvar_rows[:, :, 2]),
+        primvar_step=np.ascontiguousarray(primvar_rows[:, :, 2]),
+        primvar_size=np.ascontiguousarray(primvar_rows[:, :, 3]),
     )
     return geometry, bvh, slots
+
+
+def _joined(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """One array of all; itself where there is but one, as a million places are worth not to be copied."""
+    return np.ascontiguousarray(arrays[0] if len(arrays) == 1 else np.concatenate(arrays))
 
 
 def _touched(pile: _Pile) -> NDArray[np.uint8]:
@@ -331,9 +419,14 @@ def _touched(pile: _Pile) -> NDArray[np.uint8]:
 
 def rows_of(geometry: Geometry, part: int) -> slice:
     """A part's primitives, as rows of `Geometry.triangles`."""
-    first = geometry.first
-    last = first[part + 1] if part + 1 < len(first) else len(geometry.triangles)
-    return slice(int(first[part]), int(last))
+    first = int(geometry.first[part])
+    return slice(first, first + int(geometry.primitives[part]))
+
+
+def places_of(geometry: Geometry, part: int) -> NDArray[np.float32]:
+    """A part's places, shape (N, 3, 4): engine world from where its points are."""
+    k = int(geometry.place[part])
+    return geometry.transforms[k : k + int(geometry.places[part])] if k >= 0 else np.eye(3, 4, dtype=np.float32)[None]
 
 
 def caster_sets(scene: Scene) -> list[frozenset[str]]:
@@ -359,22 +452,50 @@ def _mask(
     return mask
 
 
-def _add_mesh(pile: _Pile, mesh: Mesh, thing: int, mask_of_triangle: NDArray[np.int64]) -> None:
-    bounds = (mesh.points.min(axis=0), mesh.points.max(axis=0)) if len(mesh.points) else (np.zeros(3), np.zeros(3))
-    base = pile.point_count
-    pile.points.append(mesh.points)
-    pile.point_count += len(mesh.points)
+class _Cut(NamedTuple):
+    """The triangles of a mesh that have one mask."""
+
+    mask: int
+    triangles: NDArray[np.uint32]
+    materials: NDArray[np.int32]
+    normals: NDArray[np.float32] | None
+    primvars: dict[str, NDArray[np.float32]]
+
+
+def _cuts(mesh: Mesh, base: int, mask_of_triangle: NDArray[np.int64]) -> list[_Cut]:
+    """By their masks. `base`: row of the mesh's first point."""
+    cuts = []
     for mask in np.unique(mask_of_triangle):
         keep = slice(None) if (mask_of_triangle == mask).all() else np.flatnonzero(mask_of_triangle == mask)
         primvars = {k: v if v.shape[1] == 1 else v[keep] for k, v in mesh.primvars.items()}
+        triangles = (mesh.triangles[keep] + np.uint32(base)).astype(np.uint32)
+        normals = None if mesh.normals is None else mesh.normals[keep]
+        cuts.append(_Cut(int(mask), triangles, mesh.materials[keep].astype(np.int32), normals, primvars))
+    return cuts
+
+
+def _add_mesh(pile: _Pile, mesh: Mesh, thing: int, mask_of_triangle: NDArray[np.int64]) -> None:
+    bounds = (mesh.points.min(axis=0), mesh.points.max(axis=0)) if len(mesh.points) else (np.zeros(3), np.zeros(3))
+    for cut in _cuts(mesh, pile.add_points(mesh.points), mask_of_triangle):
+        part = Part(cut.mask, cut.triangles)
+        pile.add(part, cut.materials, thing, not mesh.closed, cut.normals, cut.primvars, bounds)
+
+
+def _add_instances(pile: _Pile, many: Instances, thing: int, mask_of_triangle: NDArray[np.int64]) -> None:
+    """What is the same of other instances is there once."""
+    mesh, bounds = many.mesh, bounds_of(many)
+    base = pile.once((id(mesh.points),), lambda: pile.add_points(mesh.points))
+    _, pattern = np.unique(mask_of_triangle, return_inverse=True)
+    arrays = mesh.triangles, mesh.materials, mesh.normals, *mesh.primvars.values()
+    key = base, pattern.tobytes(), tuple(mesh.primvars), tuple(map(id, arrays))
+    cuts = pile.once(key, lambda: _cuts(mesh, base, pattern))
+    # Embree has one hierarchy for all that have the same array of triangles, whatever their materials.
+    bare = pile.once((base, pattern.tobytes(), id(mesh.triangles)), lambda: [cut.triangles for cut in cuts])
+    for k, (cut, triangles) in enumerate(zip(cuts, bare, strict=True)):
+        mask = int(mask_of_triangle[pattern == cut.mask][0])
+        part = Part(mask, triangles, transforms=many.transforms)
         pile.add(
-            Part(int(mask), (mesh.triangles[keep] + np.uint32(base)).astype(np.uint32)),
-            mesh.materials[keep].astype(np.int32),
-            thing,
-            not mesh.closed,
-            None if mesh.normals is None else mesh.normals[keep],
-            primvars,
-            bounds,
+            part, cut.materials, thing, not mesh.closed, cut.normals, cut.primvars, bounds, many.primvars, (*key, k)
         )
 
 
@@ -383,6 +504,20 @@ def _add_sphere(pile: _Pile, ball: Sphere, thing: int, mask: int) -> None:
     centre = np.array(ball.centre)
     bounds = (centre - ball.radius, centre + ball.radius)
     pile.add(part, np.array([ball.material], np.int32), thing, False, None, ball.primvars, bounds)
+
+
+def _check_instances(many: Instances, material_count: int) -> None:
+    count = len(many.transforms)
+    _check_mesh(many.mesh, material_count)
+    if len(many.paths) != count:
+        raise SceneError(f"{many.mesh.path}: {count} transforms but {len(many.paths)} paths")
+    for name, values in many.primvars.items():
+        if values.ndim != 2 or len(values) != count or name in many.mesh.primvars:
+            raise SceneError(f"{many.mesh.path}: primvar {name} of instances must be new, and of shape ({count}, D)")
+    try:
+        embree.check_transforms(many.transforms)
+    except SceneError as error:
+        raise SceneError(f"{many.mesh.path}: {error}") from None
 
 
 def _check_mesh(mesh: Mesh, material_count: int) -> None:

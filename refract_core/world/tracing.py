@@ -36,7 +36,7 @@ from .embree import (
     set_ray,
 )
 from .offsets import off_surface, past, short_of
-from .surface import Ray, color_input, drawn_model, float_input, hit_in, interaction, share_input
+from .surface import Ray, color_input, drawn_model, float_input, hit_in, interaction, share_input, surface_of
 from .tables import World
 
 _MAX_CUTOUTS = 64
@@ -68,11 +68,10 @@ def _absent(world: World, packet: Packet, lane: int) -> bool:
     # belongs to none goes by its own bits, so that it is the same wherever it is traced.
     if packet.sample[lane] >= 0:
         pixel, turn = int(np.int32(hash32(packet.x[lane], packet.y[lane], 0))), packet.sample[lane] * _GOLDEN % 1.0
-        return opacity <= (chance_of_bits(pixel, hit.part, 0) + turn) % 1.0
+        return opacity <= (chance_of_bits(pixel, surface_of(world.geometry, hit), 0) + turn) % 1.0
     words = packet.words
-    return opacity <= chance_of_bits(
-        words[DIR_X, lane] ^ words[ORG_X, lane], words[DIR_Y, lane], words[DIR_Z, lane] ^ hit.part
-    )
+    z = words[DIR_Z, lane] ^ surface_of(world.geometry, hit)
+    return opacity <= chance_of_bits(words[DIR_X, lane] ^ words[ORG_X, lane], words[DIR_Y, lane], z)
 
 
 @inlined

@@ -1,0 +1,195 @@
+"""What stands in many places: its bounds, what of it is around a point, and single ones as meshes of their own.
+
+Rays meet instances as they are (`tables`, `surface`). Whoever needs triangles in engine world asks here, and for as few
+as will do: a million instances are as many triangles as no memory holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..scene import F64, Instances, Mesh, Notice, Scene, Sphere, prim_of
+from .solid import encloses
+
+_SOME = 1 << 16
+"""Places that are looked at together."""
+_MOST_GLOWING = 1 << 21
+"""Triangles that instances which glow have together, at most, to light the scene."""
+
+
+def linears(many: Instances, chosen: slice | NDArray[np.integer] = slice(None)) -> tuple[F64, F64]:
+    """Linear parts (N, 3, 3) and origins (N, 3) [m] of some places."""
+    some = many.transforms[chosen].astype(np.float64)
+    return some[:, :, :3], some[:, :, 3]
+
+
+def _steps(many: Instances) -> Iterator[slice]:
+    return (slice(start, start + _SOME) for start in range(0, len(many), _SOME))
+
+
+def bounds_of(many: Instances) -> tuple[F64, F64]:
+    """Low and high corner [m] of a box that holds all of them; it may be larger than it need be."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    if not len(many.mesh.points) or not len(many):
+        return np.zeros(3), np.zeros(3)
+    ends = np.stack([many.mesh.points.min(axis=0), many.mesh.points.max(axis=0)]).astype(np.float64)
+    middle, half = ends.mean(axis=0), (ends[1] - ends[0]) / 2
+    for step in _steps(many):
+        linear, origin = linears(many, step)
+        at, reach = linear @ middle + origin, np.abs(linear) @ half
+        low, high = np.minimum(low, (at - reach).min(axis=0)), np.maximum(high, (at + reach).max(axis=0))
+    return low, high
+
+
+def boxes(many: Instances, points: F64) -> tuple[F64, F64]:
+    """Lowest and highest corner of each, shape (N, 3) [m]. `points`: shape (V, 3), the corners that count."""
+    low, high = np.empty((len(many), 3)), np.empty((len(many), 3))
+    step = max(1, (1 << 22) // max(1, 3 * len(points)))
+    for start in range(0, len(many), step):
+        linear, origin = linears(many, slice(start, start + step))
+        at = linear @ points.T
+        low[start : start + step] = at.min(axis=2) + origin
+        high[start : start + step] = at.max(axis=2) + origin
+    return low, high
+
+
+def placed(many: Instances, k: int) -> Mesh:
+    """One of them as a mesh in engine world."""
+    mesh, (linear, origin) = many.mesh, (part[0] for part in linears(many, slice(k, k + 1)))
+    order = [0, 2, 1] if np.linalg.det(linear) < 0.0 else [0, 1, 2]
+    normals = mesh.normals
+    if normals is not None:
+        turned = normals.astype(np.float64) @ np.linalg.inv(linear)
+        turned /= np.maximum(np.linalg.norm(turned, axis=2, keepdims=True), 1e-300)
+        normals = np.ascontiguousarray(turned[:, order], np.float32)
+    primvars = {name: v if v.shape[1] == 1 else np.ascontiguousarray(v[:, order]) for name, v in mesh.primvars.items()}
+    primvars |= {name: values[k].reshape(1, 1, -1) for name, values in many.primvars.items()}
+    return replace(
+        mesh,
+        path=many.paths[k],
+        points=(mesh.points.astype(np.float64) @ linear.T + origin).astype(np.float32),
+        triangles=np.ascontiguousarray(mesh.triangles[:, order]),
+        normals=normals,
+        primvars=primvars,
+    )
+
+
+def some_placed(many: Instances, most: int) -> Iterator[Mesh]:
+    """As many as asked for, spread evenly over all of them."""
+    count = min(most, len(many))
+    return (placed(many, int(k)) for k in np.unique(np.linspace(0, len(many) - 1, count).astype(np.int64)))
+
+
+def flat(scene: Scene, most: int) -> Scene:
+    """The scene with instances as meshes, at most so many of one mesh; of more, an even choice stands for all."""
+    if not scene.instances:
+        return scene
+    meshes = tuple(mesh for many in scene.instances for mesh in some_placed(many, most))
+    return replace(scene, meshes=scene.meshes + meshes, instances=())
+
+
+def around(many: Instances, point: Iterable[float]) -> list[int]:
+    """Which of a closed mesh's places go round a point [m]."""
+    at, mesh = np.array(tuple(point), np.float64), many.mesh
+    if not len(mesh.points):
+        return []
+    low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
+    found: list[int] = []
+    for step in _steps(many):
+        linear, origin = linears(many, step)
+        inside = np.linalg.solve(linear, (at - origin)[:, :, None])[:, :, 0]
+        for k in np.flatnonzero(((inside > low) & (inside < high)).all(axis=1)):
+            if encloses(mesh.points, mesh.triangles, inside[k]):
+                found.append(step.start + int(k))
+    return found
+
+
+def take(many: Instances, chosen: NDArray[np.integer]) -> Instances:
+    """Those in places, which ascend."""
+    primvars = {name: values[chosen] for name, values in many.primvars.items()}
+    return Instances(many.mesh, many.transforms[chosen], many.paths.take(chosen), primvars)
+
+
+def within(many: Instances, prims: frozenset[str]) -> Instances:
+    """Those that belong to some prims."""
+    kept = [(owner in prims, count) for owner, count in many.paths.owners()]
+    if all(keep for keep, _ in kept):
+        return many
+    return take(many, np.flatnonzero(np.repeat([keep for keep, _ in kept], [count for _, count in kept])))
+
+
+# --- for rays -------------------------------------------------------------------------------------------------------
+
+
+def settled(scene: Scene) -> Scene:
+    """The scene as rays can meet it: what glows in many places are meshes, as each of its triangles is a light; and
+    instances that collections tell apart, of what a probe sees or a light lights, are apart."""
+    if not scene.instances:
+        return scene
+    meshes, kept, notices = list(scene.meshes), [], list(scene.notices)
+    left = _MOST_GLOWING
+    for many in scene.instances:
+        if not _glows(many, scene):
+            kept.append(many)
+        elif (size := len(many) * len(many.mesh.triangles)) <= left:
+            left -= size
+            meshes.extend(placed(many, k) for k in range(len(many)))
+        else:
+            text = f"its {len(many)} instances glow, but light nothing: they have {size} triangles together, and what "
+            notices.append(Notice(many.paths[0], f"{text}glows in many places may have {_MOST_GLOWING}"))
+            kept.append(many)
+    told = [frozenset(paths) for paths in _collections(scene)]
+    apart = [one for many in kept for one in (_apart(many, told) if told else [many])]
+    return replace(scene, meshes=tuple(meshes), instances=tuple(apart), notices=tuple(notices))
+
+
+def _glows(many: Instances, scene: Scene) -> bool:
+    used = (scene.materials[m] for m in np.unique(many.mesh.materials).tolist())
+    return any(material.emits and not material.refractive for material in used)
+
+
+def _collections(scene: Scene) -> Iterator[tuple[str, ...]]:
+    said = [probe.captured for probe in scene.probes]
+    said += [paths for light in scene.lights for paths in (light.lit, light.casters)]
+    return (paths for paths in dict.fromkeys(said) if paths is not None)
+
+
+def _apart(many: Instances, collections: list[frozenset[str]]) -> list[Instances]:
+    """Instances by the collections that they are in."""
+    numbers: dict[tuple[bool, ...], int] = {}
+    kinds, counts = [], []
+    for owner, count in many.paths.owners():
+        kinds.append(numbers.setdefault(tuple(owner in paths for paths in collections), len(numbers)))
+        counts.append(count)
+    if len(numbers) <= 1:
+        return [many]
+    which = np.repeat(kinds, counts)
+    return [take(many, np.flatnonzero(which == kind)) for kind in range(len(numbers))]
+
+
+def thing_count(scene: Scene) -> int:
+    """Things that have a number: meshes, spheres, and every instance."""
+    return len(scene.meshes) + len(scene.spheres) + sum(map(len, scene.instances))
+
+
+def instances_at(scene: Scene, thing: int) -> Instances:
+    """Those whose first has a number."""
+    first = len(scene.meshes) + len(scene.spheres)
+    for many in scene.instances:
+        if first == thing and len(many):
+            return many
+        first += len(many)
+    raise KeyError(thing)
+
+
+def paths_of(scene: Scene) -> Iterator[tuple[str, int]]:
+    """Prims that things belong to (`scene.prim_of`), in the order of their numbers, and how many in a row do."""
+    alone: tuple[Mesh | Sphere, ...] = (*scene.meshes, *scene.spheres)
+    yield from ((prim_of(thing.path), 1) for thing in alone)
+    for many in scene.instances:
+        yield from many.paths.owners()
+
