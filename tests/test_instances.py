@@ -275,12 +275,13 @@ def test_links_tell_instances_apart(collection: str) -> None:
     """A light that one of two boxes is linked to, and casts shadows by one of them."""
     floor = quad("/floor", [(-2, -0.5, 2), (2, -0.5, 2), (2, -0.5, -2), (-2, -0.5, -2)], 0)
     lamp = light(LightKind.SPHERE, (0, 2.5, 1), (0, -1, -0.4), (0.05, 0.0), 100.0)
-    lamp = replace(lamp, **{collection: ("/floor", "/b")})
+    linked: dict[str, Any] = {collection: ("/floor", "/b")}
     of = scene([floor], [material("/white", DIFFUSE=0.8)], lights=(lamp,), cameras=(camera((0, 2, 3)),))
+    linked_of = replace(of, lights=(replace(lamp, **linked),))
     many = Instances(box("/box", (0.2, 0.2, 0.2), 0), places((-0.5, 0, 0), (0.5, 0, 0)), Paths(("/a", "/b")))
-    a = draw(replace(of, instances=(many,)))
-    b = draw(replace(of, meshes=(floor, placed(many, 0), placed(many, 1))))
-    c = draw(replace(of, lights=(replace(lamp, **{collection: None}),), instances=(many,)))
+    a = draw(replace(linked_of, instances=(many,)))
+    b = draw(replace(linked_of, meshes=(floor, placed(many, 0), placed(many, 1))))
+    c = draw(replace(of, instances=(many,)))
     assert differing(a, b) < 0.003 < differing(a, c)
 
 

@@ -21,6 +21,7 @@ from .camera import choose_camera, read_cameras
 from .diagnostics import captured, words_of
 from .geometry.cages import FINENESS
 from .geometry.curves import cuts_for
+from .geometry.many import Bodies, Group, bounds_of_group, shared
 from .geometry.parts import MOST_IN_ALL, Bound, Part, Tables, affordable, assemble, bind
 from .geometry.place import Placed, bounds_of, place, to_mesh, to_sphere
 from .geometry.refined import MOST_TRIANGLES, Fineness
@@ -29,7 +30,7 @@ from .geometry.skel import posed
 from .geometry.traverse import Placement, refuse_too_many, some_of, walk
 from .geometry.ways import with_ways
 from .layers import mtlx
-from .lights.meshes import glowing
+from .lights.meshes import glowing, mesh_lights
 from .lights.read import read_lights
 from .opening import mask_of, open_as
 from .ours import recognised
@@ -223,15 +224,17 @@ def _read(
     metres_from_stage = _upright(stage, notices) @ np.diag([metres_per_unit] * 3 + [1.0])
     tables = Tables(time, metres_per_unit, notices, FINENESS[complexity])
     drawn = walk(stage, time, purposes, notices)
-    placed = _placed(keep(drawn, tables) if keep else drawn, metres_from_stage, tables)
-    extent = bounds_of(placed)
+    placed, groups = _placed(stage, keep(drawn, tables) if keep else drawn, metres_from_stage, tables)
+    extent = _extent([bounds_of(placed), *(bounds_of_group(group) for group in groups)])
     if extent is None:
         notices.append(Notice("/", "nothing is visible at this time and with these purposes; the scene is empty"))
         extent = -np.ones(3), np.ones(3)
     centre = _origin(*extent)
     meshes, spheres = _drawn(placed, centre)
     meshes = glowing(stage, time, meshes, tables.materials, metres_per_unit=metres_per_unit, notices=notices)
-    materials = with_ways(tables.materials, meshes, spheres, metres_per_unit, notices)
+    bodies = Bodies()
+    instances = tuple(bodies.instances(groups.pop(0), centre) for _ in range(len(groups)))
+    materials = with_ways(tables.materials, meshes, spheres, instances, metres_per_unit, notices)
     engine_from_stage = metres_from_stage.copy()
     engine_from_stage[:3, 3] = -centre
     bounds = triple(extent[0] - centre), triple(extent[1] - centre)
@@ -240,20 +243,24 @@ def _read(
         "metres_per_unit": metres_per_unit,
         "notices": notices,
     }
-    moving = not (all(mesh.static for mesh in meshes) and all(ball.static for ball in spheres))
+    still = [mesh.static for mesh in meshes] + [ball.static for ball in spheres]
+    still += [many.mesh.static for many in instances]
     every_camera = read_cameras(stage, time, **frame)
-    cameras = choose_camera(stage, time, every_camera, camera, bounds, moving=moving, **frame)
-    things = [mesh.path for mesh in meshes] + [ball.path for ball in spheres]
-    paths = tuple(dict.fromkeys(prim_of(path) for path in things))
+    cameras = choose_camera(stage, time, every_camera, camera, bounds, moving=not all(still), **frame)
+    things = [prim_of(mesh.path) for mesh in meshes] + [prim_of(ball.path) for ball in spheres]
+    things += [owner for many in instances for owner, _ in many.paths.owners()]
+    paths = tuple(dict.fromkeys(things))
     lights, environment = read_lights(stage, time, purposes=purposes, drawn=paths, **frame)
     every = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
     glow = {m for m, material in enumerate(tables.materials) if material.emits}
-    used = {m for mesh in meshes for m in np.unique(mesh.materials).tolist()} | {ball.material for ball in spheres}
+    every_mesh = (*meshes, *(many.mesh for many in instances))
+    used = {m for mesh in every_mesh for m in np.unique(mesh.materials).tolist()} | {ball.material for ball in spheres}
     lit = bool(glow & used) or any(prim.HasAPI(UsdLux.LightAPI) for prim in every)
     return Scene(
         meshes=meshes,
         materials=tuple(materials),
         spheres=spheres,
+        instances=instances,
         textures=tuple(tables.textures.values()),
         lights=lights,
         environment=environment,
@@ -304,7 +311,17 @@ def _upright(stage: Usd.Stage, notices: list[Notice]) -> F64:
     return turned
 
 
-def _placed(placements: list[Placement], metres_from_stage: F64, tables: Tables) -> list[Placed]:
+def _extent(bounds: list[tuple[F64, F64] | None]) -> tuple[F64, F64] | None:
+    """Lowest and highest corner of all; None where there is nothing."""
+    known = [box for box in bounds if box is not None]
+    if not known:
+        return None
+    return np.min([low for low, _ in known], axis=0), np.max([high for _, high in known], axis=0)
+
+
+def _placed(
+    stage: Usd.Stage, placements: list[Placement], metres_from_stage: F64, tables: Tables
+) -> tuple[list[Placed], list[Group]]:
     """Reads every prim once and puts it wherever it is drawn."""
     prims = list({placement.prim.GetPath(): placement.prim for placement in placements}.values())
     shapes: dict[Sdf.Path, Shape | None] = {}
@@ -315,13 +332,16 @@ def _placed(placements: list[Placement], metres_from_stage: F64, tables: Tables)
         parts[prim.GetPath()] = _part(prim, bound, shapes, tables)
     tables.notices.extend(_coarse(parts, asked, tables.fineness))
     tables.notices.extend(_turned(prims, parts))
+    proxies = any(placement.prim.IsInstanceProxy() for placement in placements)
+    own = mesh_lights(stage) if proxies else frozenset()
+    alone, groups = shared(placements, parts, own, metres_from_stage, tables)
     placed = []
-    for placement in placements:
+    for placement in alone:
         part = parts[placement.prim.GetPath()]
         item = place(part, placement, metres_from_stage, tables) if part is not None else None
         if item is not None:
             placed.append(item)
-    return placed
+    return placed, groups
 
 
 def _coarse(parts: dict[Sdf.Path, Part | None], asked: Fineness, used: Fineness) -> Iterator[Notice]:

@@ -138,7 +138,7 @@ def contents(
 def drawn(
     stage: Usd.Stage, time: Usd.TimeCode, notices: list[Notice]
 ) -> tuple[list[Usd.Prim], Callable[[Usd.Prim], list[F64]]]:
-    """Every prim with a surface, and a function that gives where it is drawn: world_from_prim, shape (4, 4)."""
+    """Every prim with a surface, and a function that gives where it is drawn: world_from_prim, shape (3, 4)."""
     every = list(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
     if any(prim.GetTypeName() == "PointInstancer" for prim in every):
         places: dict[Sdf.Path, list[F64]] = defaultdict(list)
@@ -146,13 +146,13 @@ def drawn(
         for placement in walk(stage, time, PURPOSES, notices):
             if placement.prim.GetPath() not in places:
                 instanced.append(placement.prim)
-            places[placement.prim.GetPath()].append(placement.world_from_prim)
+            places[placement.prim.GetPath()].extend(placement.worlds)
         return instanced, lambda prim: places[prim.GetPath()]
     cache = UsdGeom.XformCache(time)
 
     def place(prim: Usd.Prim) -> list[F64]:
         hidden = UsdGeom.Imageable(prim).ComputeVisibility(time) == UsdGeom.Tokens.invisible
-        return [] if hidden else [np.array(cache.GetLocalToWorldTransform(prim)).T]
+        return [] if hidden else [np.array(cache.GetLocalToWorldTransform(prim)).T[:3]]
 
     return [prim for prim in every if prim.GetTypeName() in DRAWN], place
 

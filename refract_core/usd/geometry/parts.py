@@ -20,7 +20,13 @@ from .shapes import Shape
 from .traverse import Placement, some_of
 
 MOST_IN_ALL = 4_000_000
-"""Triangles that the subdivision surfaces of a stage have together, counted wherever they are drawn."""
+"""Triangles that the subdivision surfaces of a stage have together, counted wherever they are drawn, but once where an
+instancer draws so many that they are one mesh (`many.shared`)."""
+FEW = 8
+"""Places from which on a prim may stay one mesh."""
+SMALL = 4096
+"""Triangles that all of its places have together, from which on it does: less is as fast and as small as meshes of
+their own, which everything else knows how to look at."""
 
 
 @dataclass
@@ -63,14 +69,22 @@ class Part(NamedTuple):
     """Names its materials read, whether it has them or not."""
 
 
+def stays_one(places: int, triangles: int) -> bool:
+    """A prim that is drawn in many places is one mesh with many transforms."""
+    return places >= FEW and places * triangles >= SMALL
+
+
 def affordable(placements: Sequence[Placement], time: Usd.TimeCode, fineness: Fineness) -> Fineness:
     """As fine as subdivision surfaces may be for all of a stage to have `MOST_IN_ALL` triangles of them."""
-    drawn = Counter(placement.prim.GetPath() for placement in placements)
+    drawn: Counter[Sdf.Path] = Counter()
+    for placement in placements:
+        drawn[placement.prim.GetPath()] += len(placement.worlds)
     prims = {placement.prim.GetPath(): placement.prim for placement in placements}
     meshes = [(UsdGeom.Mesh(prim), drawn[path]) for path, prim in prims.items() if is_subdivided(prim, time)]
     plain = [fineness._replace(steps=steps, few=0) for steps in range(fineness.steps, 0, -1)]
     for fewer in (fineness, *plain):
-        if sum(times * surface_size(mesh, time, fewer) for mesh, times in meshes) <= MOST_IN_ALL:
+        sizes = [(times, surface_size(mesh, time, fewer)) for mesh, times in meshes]
+        if sum(size if stays_one(times, size) else times * size for times, size in sizes) <= MOST_IN_ALL:
             return fewer
     return fineness._replace(steps=0, few=0)
 

@@ -13,9 +13,11 @@ from .primvars import Corners, spread
 from .traverse import Placement
 from .triangulate import has_area, turned_over
 
-_LARGEST = 1.0e15
-_FLAT = 1.0e-12
+LARGEST = 1.0e15
+FLAT = 1.0e-12
 """Volume of a transformed cube, relative to its edges, under which the transform flattens."""
+BEYOND = "skipped: its transform is not finite or takes it beyond 1e15 m"
+NOTHING_LEFT = "skipped: its transform has a scale of 0"
 _ROUND = 1.0e-6
 """Relative deviation up to which a transform counts as rotation and uniform scale."""
 
@@ -38,28 +40,27 @@ class Placed(NamedTuple):
 
 
 def place(part: Part, placement: Placement, metres_from_stage: F64, tables: Tables) -> Placed | None:
-    """Transforms a part; None, with a notice, where its transform leaves nothing that could be drawn.
+    """Transforms a part to the one place of a placement; None, with a notice, where that leaves nothing to draw.
 
     Args:
         metres_from_stage: shape (4, 4), column vectors: turns Y up and scales
     """
-    matrix = metres_from_stage @ placement.world_from_prim @ part.shape.prim_from_shape
+    matrix = metres_from_stage @ _square(placement.worlds[0]) @ part.shape.prim_from_shape
     linear, origin = matrix[:3, :3], matrix[:3, 3]
     extra = _of_instance(part, placement, tables)
     if part.shape.is_sphere and all(values.shape[:2] == (1, 1) for values in part.primvars.values()):
         radius = uniform_scale(linear)
-        if 0.0 < radius < _LARGEST and np.abs(origin).max() < _LARGEST:
+        if 0.0 < radius < LARGEST and np.abs(origin).max() < LARGEST:
             return Placed(part, placement, origin[None], linear, 1, extra, radius)
     # An infinite or NaN transform is told by its result.
     with np.errstate(all="ignore"):
         points = part.shape.points @ linear.T + origin
-    if not (points.min() > -_LARGEST and points.max() < _LARGEST):
-        text = "skipped: its transform is not finite or takes it beyond 1e15 m"
-        tables.notices.append(Notice(placement.path, text))
+    if not (points.min() > -LARGEST and points.max() < LARGEST):
+        tables.notices.append(Notice(placement.path, BEYOND))
         return None
     sense = _sense(linear)
     if sense == 0 and not has_area(points, part.shape.triangles.astype(np.int64)).any():
-        tables.notices.append(Notice(placement.path, "skipped: its transform has a scale of 0"))
+        tables.notices.append(Notice(placement.path, NOTHING_LEFT))
         return None
     return Placed(part, placement, points, linear, sense, extra)
 
@@ -69,7 +70,7 @@ def _sense(linear: F64) -> int:
     (a, b, c), (d, e, f), (g, h, i) = linear.tolist()
     determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
     edges = math.hypot(a, d, g) * math.hypot(b, e, h) * math.hypot(c, f, i)
-    return 0 if abs(determinant) <= _FLAT * edges else int(math.copysign(1.0, determinant))
+    return 0 if abs(determinant) <= FLAT * edges else int(math.copysign(1.0, determinant))
 
 
 def uniform_scale(linear: F64, tolerance: float = _ROUND) -> float:
@@ -135,14 +136,24 @@ def _normals(normals: Corners | None, item: Placed) -> F32 | None:
     return spread(Corners(turned.astype(np.float32), normals.rows), mirrored=item.sense < 0)
 
 
+def _square(world: F64) -> F64:
+    """A transform of shape (3, 4) as (4, 4)."""
+    return np.vstack([world, [0.0, 0.0, 0.0, 1.0]])
+
+
 def _of_instance(part: Part, placement: Placement, tables: Tables) -> dict[str, F32]:
     """Primvars a point instancer gives its instance and the prim has not itself."""
+    return {name: values[0].reshape(1, 1, -1) for name, values in of_instances(part, placement, tables).items()}
+
+
+def of_instances(part: Part, placement: Placement, tables: Tables) -> dict[str, F32]:
+    """The same for all places of a placement: name -> shape (N, D). What not all of them have is left out."""
     if placement.instance is None:
         return {}
-    instancer, number = placement.instance
+    instancer, numbers = placement.instance
     found = {}
     for name in part.wanted - part.primvars.keys():
         values = instance_values(instancer, name, tables)
-        if values is not None and number < len(values):
-            found[name] = values[number].reshape(1, 1, -1)
+        if values is not None and numbers.max() < len(values):
+            found[name] = values[numbers]
     return found

@@ -10,12 +10,14 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom
 
 from ...errors import StageError
-from ...scene import F64, Notice
+from ...scene import F64, Notice, Run
 from .gprims import ATTRIBUTES
 from .triangulate import Index
 
-MAX_INSTANCES = 100_000
+MAX_INSTANCES = 4_000_000
 """Prims that point instancers may stand for, in all."""
+_SOME = 1 << 16
+"""Instances whose transforms are multiplied together."""
 MAX_PRIMS = 4_000_000
 """Prims looked at, native instances expanded."""
 
@@ -35,17 +37,37 @@ _INSTANCER_ATTRIBUTES = ("protoIndices", "positions", "orientations", "orientati
 
 
 class Placement(NamedTuple):
-    """One prim at one place."""
+    """One prim at one place, or at all to which a point instancer takes it."""
 
     prim: Usd.Prim
-    path: str
-    """Where it is drawn; `/Instancer/[7]/Proto/Mesh` for what instance 7 of a point instancer draws."""
-    world_from_prim: F64
-    """shape (4, 4), column vectors, in the stage's own world and units"""
+    run: Run
+    """Where it is drawn: N paths, `/Instancer/[7]/Proto/Mesh` for what instance 7 of a point instancer draws"""
+    worlds: F64
+    """shape (N, 3, 4), in the stage's own world and units"""
     static: bool
     """Nothing that moves it varies in time, and `primvars:refract:static` is not 0."""
-    instance: tuple[Usd.Prim, int] | None = None
-    """The innermost point instancer and the index in it."""
+    instance: tuple[Usd.Prim, Index] | None = None
+    """The innermost point instancer and, of shape (N,), the index in it."""
+
+    @property
+    def path(self) -> str:
+        """The first of its paths."""
+        return self.run.path(0)
+
+    @property
+    def paths(self) -> str | Run:
+        """As `scene.Paths` has them."""
+        return self.run if self.run.numbers.shape[1] else self.path
+
+    def at(self, rows: Index) -> Placement:
+        """Some of its places."""
+        instance = None if self.instance is None else (self.instance[0], self.instance[1][rows])
+        run = Run(self.run.pieces, self.run.numbers[rows])
+        return Placement(self.prim, run, self.worlds[rows], self.static, instance)
+
+
+_ONE = np.zeros((1, 0), np.int32)
+"""The numbers in the one path of what no point instancer draws."""
 
 
 class _Node(NamedTuple):
@@ -154,7 +176,7 @@ def _descend(
         if prim.IsA(UsdGeom.Gprim) and _wanted(state, here):
             kind = str(prim.GetTypeName())
             if kind in DRAWN:
-                yield Placement(prim, label, np.array(here.world).T, here.static)
+                yield Placement(prim, Run((label,), _ONE), np.array(here.world).T[None, :3], here.static)
             else:
                 state.unsupported.setdefault(kind, []).append(label)
         children = prim.GetFilteredChildren(predicate)
@@ -200,11 +222,27 @@ def _instances(state: _Walk, node: _Node, label: str) -> Iterator[Placement]:
         chosen = np.flatnonzero(prototypes == place)
         parts = _prototype(state, node, target, static, drawn=len(chosen))
         for part in parts:
-            placed = world @ transforms[chosen] @ part.world_from_prim
-            for row, number in enumerate(numbers[chosen].tolist()):
-                where = f"{label}/[{number}]{part.path}"
-                yield Placement(part.prim, where, placed[row], part.static, part.instance or (prim, number))
+            yield _multiplied(part, prim, label, numbers[chosen], world, transforms, chosen)
     state.within = outer
+
+
+def _multiplied(
+    part: Placement, instancer: Usd.Prim, label: str, numbers: Index, world: F64, transforms: F64, chosen: Index
+) -> Placement:
+    """What one instance draws of a prim, for all of them: `chosen` rows of `transforms`, which have `numbers`."""
+    places, each = len(chosen), len(part.worlds)
+    worlds = np.empty((places, each, 3, 4))
+    square = np.zeros((each, 4, 4))
+    square[:, :3], square[:, 3, 3] = part.worlds, 1.0
+    for start in range(0, places, _SOME):
+        some = world @ transforms[chosen[start : start + _SOME]]
+        worlds[start : start + _SOME] = (some[:, None] @ square)[:, :, :3]
+    first, *rest = part.run.pieces
+    inner = np.broadcast_to(part.run.numbers, (places, *part.run.numbers.shape))
+    outer = np.broadcast_to(numbers.astype(np.int32)[:, None, None], (places, each, 1))
+    run = Run((f"{label}/[", f"]{first}", *rest), np.concatenate([outer, inner], axis=2).reshape(places * each, -1))
+    instance = (instancer, numbers) if part.instance is None else (part.instance[0], np.tile(part.instance[1], places))
+    return Placement(part.prim, run, worlds.reshape(-1, 3, 4), part.static, instance)
 
 
 def _prototype(state: _Walk, node: _Node, target: Sdf.Path, static: bool, *, drawn: int) -> list[Placement]:
@@ -217,7 +255,7 @@ def _prototype(state: _Walk, node: _Node, target: Sdf.Path, static: bool, *, dra
         return []
     start = _Node(root, Gf.Matrix4d(1.0), node.purpose, static)
     parts = list(_descend(state, start, _PROTOTYPES, len(str(target)) - len(target.name) - 1, placed=True))
-    state.expanded += len(parts) * drawn
+    state.expanded += sum(len(part.worlds) for part in parts) * drawn
     if state.expanded > MAX_INSTANCES:
         raise StageError(
             f"{node.prim.GetPath()}: point instancers expand to {state.expanded} prims by here; at most "

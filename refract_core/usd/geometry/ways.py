@@ -7,21 +7,28 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...scene import Material, Mesh, Notice, Sphere
+from ...scene import Instances, Material, Mesh, Notice, Sphere
+from ...world.instances import some_placed
 from ...world.solid import mean_way
+
+_LOOKED_AT = 64
+"""Places of a mesh that are measured; of more, an even choice stands for all."""
 
 
 def with_ways(
-    materials: Sequence[Material], meshes: Sequence[Mesh], spheres: Sequence[Sphere], metres_per_unit: float,
-    notices: list[Notice],
+    materials: Sequence[Material], meshes: Sequence[Mesh], spheres: Sequence[Sphere], instances: Sequence[Instances],
+    metres_per_unit: float, notices: list[Notice],
 ) -> list[Material]:  # fmt: skip
     """The materials, of which those that tint have their colour after the mean way through a body: of several the
     median."""
     ways: dict[int, list[float]] = {m: [] for m, material in enumerate(materials) if material.tints}
     for mesh in meshes if ways else ():
-        used = int(mesh.materials[0]) if len(mesh.materials) else -1
-        if used in ways and mesh.closed and (mesh.materials == used).all():
+        if (used := _only_one(mesh)) in ways:
             ways[used].append(mean_way(mesh.points.astype(np.float64), mesh.triangles))
+    for many in instances if ways else ():
+        if (used := _only_one(many.mesh)) in ways:
+            some = [mean_way(mesh.points.astype(np.float64), mesh.triangles) for mesh in some_placed(many, _LOOKED_AT)]
+            ways[used].extend(np.repeat(some, -(-len(many) // len(some))).tolist())
     for ball in spheres:
         if ball.material in ways:
             ways[ball.material].append(4.0 / 3.0 * ball.radius)
@@ -36,3 +43,9 @@ def with_ways(
         text += f"{distance / metres_per_unit:.3g} scene units, the mean way through its bodies; author a depth"
         notices.append(Notice(materials[m].name, text))
     return told
+
+
+def _only_one(mesh: Mesh) -> int:
+    """The material that a closed mesh is made of; -1 where there is none, or are several."""
+    used = int(mesh.materials[0]) if len(mesh.materials) and mesh.closed else -1
+    return used if (mesh.materials == used).all() else -1

@@ -26,6 +26,12 @@ def is_mesh_light(prim: Usd.Prim) -> bool:
     return bool(on_mesh or prim.GetTypeName() == "GeometryLight")
 
 
+def mesh_lights(stage: Usd.Stage) -> frozenset[str]:
+    """Paths of the meshes that some light is about."""
+    every = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
+    return frozenset(str(path) for prim in every if is_mesh_light(prim) for path in _targets(prim))
+
+
 def glowing(
     stage: Usd.Stage, time: Usd.TimeCode, meshes: tuple[Mesh, ...], materials: list[Material],
     *, metres_per_unit: float, notices: list[Notice],

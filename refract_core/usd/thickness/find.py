@@ -64,7 +64,7 @@ class Candidate:
     """Path at which a layer can say more about it; '' where none can."""
     prim: Usd.Prim
     placements: tuple[F64, ...]
-    """world_from_prim, shape (4, 4), of everything that is drawn with it"""
+    """world_from_prim, shape (3, 4), of everything that is drawn with it"""
     coats: tuple[Coat, ...]
 
     @property
@@ -137,7 +137,7 @@ def find_candidates(stage: Usd.Stage) -> Found:
             bound_to[coat.material].add(str(prim.GetPath()))
         if coats:
             edit = str(editable(at_stage) or "")
-            places = tuple(placement.world_from_prim for placement in drawn[prim.GetPath()])
+            places = tuple(world for placement in drawn[prim.GetPath()] for world in placement.worlds)
             groups[edit or str(original(at_stage))].append(Candidate((str(prim.GetPath()),), edit, prim, places, coats))
     candidates = tuple(_merged(group) for group in groups.values())
     frozen = {path: frozenset(users) for path, users in bound_to.items()}

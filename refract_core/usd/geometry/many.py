@@ -1,0 +1,237 @@
+"""Prims that are drawn in many places: which of them stay one mesh with many transforms, and how those are read.
+
+All places of a prim, and of all its proxies that look the same, are one record: what the engine keeps of each is its
+transform, its path's numbers, and what the instancer says of it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection, Hashable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from pxr import Sdf
+
+from ...errors import StageError
+from ...scene import F32, F64, Instances, Mesh, Notice, Paths
+from .parts import Part, Tables, stays_one
+from .place import BEYOND, FLAT, LARGEST, NOTHING_LEFT, of_instances
+from .primvars import spread
+from .traverse import Placement, some_of
+from .triangulate import Index
+
+MOST_APART = 100_000
+"""Places with a mesh of their own that instances may have: what is flattened has no inside to be shared."""
+_SOME = 1 << 16
+"""Places that are looked at together."""
+_LOOKED_AT = 1024
+"""Places whose bounds are measured together."""
+
+
+class Group(NamedTuple):
+    """A part in many places, in metres and Y up, not yet moved to the scene's centre."""
+
+    part: Part
+    static: bool
+    paths: Paths
+    middle: F64
+    """shape (3,): of its points, in shape space; the record's own frame is about it"""
+    matrices: F64
+    """shape (N, 3, 4), metres from that frame"""
+    primvars: dict[str, F32]
+    """name -> shape (N, D): what the instancer says of each"""
+
+
+def shared(
+    placements: list[Placement], parts: Mapping[Sdf.Path, Part | None], own: Collection[str], metres_from_stage: F64,
+    tables: Tables,
+) -> tuple[list[Placement], list[Group]]:  # fmt: skip
+    """What is to have a mesh of its own for every place, one place each, and what is not.
+
+    Args:
+        parts: by the paths of their prims
+        own: prims that something will be said of one by one
+        metres_from_stage: shape (4, 4), column vectors: turns Y up and scales
+
+    Raises:
+        StageError: more than `MOST_APART` instances cannot share a mesh.
+    """
+    alone: list[tuple[int, Placement]] = []
+    together: dict[Hashable, list[tuple[int, Placement]]] = {}
+    for number, placement in enumerate(placements):
+        part = parts[placement.prim.GetPath()]
+        if part is None:
+            continue
+        many = len(placement.worlds) > 1 or placement.prim.IsInstanceProxy()
+        if many and not _is_ball(part) and str(placement.prim.GetPath()) not in own:
+            together.setdefault(_likeness(part, placement, tables), []).append((number, placement))
+        else:
+            alone.append((number, placement))
+    groups = []
+    for found in together.values():
+        part = parts[found[0][1].prim.GetPath()]
+        assert part is not None
+        count = sum(len(placement.worlds) for _, placement in found)
+        if not stays_one(count, len(part.shape.triangles)):
+            alone.extend(found)
+            continue
+        group, left = _group(part, found, metres_from_stage, tables)
+        groups.extend(group)
+        alone.extend(left)
+    alone.sort(key=lambda one: one[0])
+    apart = sum(len(placement.worlds) for _, placement in alone if placement.instance is not None)
+    if apart > MOST_APART:
+        path = next(placement.path for _, placement in alone if placement.instance is not None)
+        text = f"{apart} instances, from this one on, cannot share a mesh, as they are flat, or spheres"
+        raise StageError(f"{path}: {text}; at most {MOST_APART} can be rendered. Deactivate some of them")
+    every = (placement.at(np.array([row])) for _, placement in alone for row in range(len(placement.worlds)))
+    return list(every), groups
+
+
+def _is_ball(part: Part) -> bool:
+    return part.shape.is_sphere and all(values.shape[:2] == (1, 1) for values in part.primvars.values())
+
+
+def _likeness(part: Part, placement: Placement, tables: Tables) -> Hashable:
+    """The same for placements that one record may hold."""
+    number = int(part.materials[0]) if len(part.materials) else -1
+    of_materials: Hashable = number
+    if part.materials is not tables.uniform.get((len(part.materials), number)):
+        of_materials = hashlib.sha256(part.materials.tobytes()).digest()
+    values = [(name, v.shape, hashlib.sha256(v.tobytes()).digest()) for name, v in part.primvars.items()]
+    says = None if placement.instance is None else str(placement.instance[0].GetPath())
+    return id(part.shape), of_materials, tuple(values), part.wanted, placement.static, says
+
+
+def _group(
+    part: Part, found: list[tuple[int, Placement]], metres_from_stage: F64, tables: Tables
+) -> tuple[list[Group], list[tuple[int, Placement]]]:
+    """One record, and what of it has to stand alone. What is nowhere, or nothing, is left out with a notice."""
+    points = part.shape.points
+    low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
+    middle, half = (low + high) / 2, (high - low) / 2
+    runs, matrices, left = [], [], []
+    lost: list[str] = []
+    gone: list[str] = []
+    for number, placement in found:
+        some = _in_metres(placement.worlds, metres_from_stage, part.shape.prim_from_shape, middle)
+        finite, sense = _judged(some, half)
+        lost += [placement.run.path(row) for row in np.flatnonzero(~finite).tolist()]
+        flat = np.flatnonzero(finite & (sense == 0))
+        sheets = _rank(some[flat]) > 1
+        gone += [placement.run.path(row) for row in flat[~sheets].tolist()]
+        if sheets.any():
+            left.append((number, placement.at(flat[sheets])))
+        kept = np.flatnonzero(finite & (sense != 0))
+        if len(kept) == len(finite):
+            runs.append(placement)
+            matrices.append(some)
+        elif len(kept):
+            runs.append(placement.at(kept))
+            matrices.append(some[kept])
+    for paths, text in ((lost, BEYOND), (gone, NOTHING_LEFT)):
+        if paths:
+            tables.notices.append(Notice(paths[0], text if len(paths) == 1 else f"{text} ({some_of(paths)})"))
+    if not runs:
+        return [], left
+    primvars = of_instances(part, runs[0], tables) if len(runs) == 1 else {}
+    where = matrices[0] if len(matrices) == 1 else np.concatenate(matrices)
+    where_drawn = Paths(tuple(placement.paths for placement in runs))
+    return [Group(part, runs[0].static and not part.shape.varying, where_drawn, middle, where, primvars)], left
+
+
+def _in_metres(worlds: F64, metres_from_stage: F64, prim_from_shape: F64, middle: F64) -> F64:
+    """Shape (N, 3, 4): metres from a frame about the middle of a shape."""
+    turned = prim_from_shape.copy()
+    turned[:3, 3] += prim_from_shape[:3, :3] @ middle
+    found = np.empty_like(worlds)
+    with np.errstate(all="ignore"):
+        for start in range(0, len(worlds), _SOME):
+            some = metres_from_stage[:3, :3] @ worlds[start : start + _SOME] @ turned
+            some[:, :, 3] += metres_from_stage[:3, 3]
+            found[start : start + _SOME] = some
+    return found
+
+
+def _judged(matrices: F64, half: F64) -> tuple[Index, Index]:
+    """Whether a box about the frame's origin stays within `LARGEST`; 1, -1 where a transform mirrors, 0 where it
+    flattens. Each of shape (N,)."""
+    finite, sense = np.zeros(len(matrices), bool), np.zeros(len(matrices), np.int64)
+    with np.errstate(all="ignore"):
+        for start in range(0, len(matrices), _SOME):
+            some = matrices[start : start + _SOME]
+            linear = some[:, :, :3]
+            reach = np.abs(some[:, :, 3]) + np.abs(linear) @ half
+            volume = (linear[:, 0] * np.cross(linear[:, 1], linear[:, 2])).sum(axis=1)
+            edges = np.linalg.norm(linear, axis=1).prod(axis=1)
+            finite[start : start + _SOME] = (reach < LARGEST).all(axis=1)
+            sense[start : start + _SOME] = np.where(np.abs(volume) > FLAT * edges, np.sign(volume), 0)
+    return finite, sense
+
+
+def _rank(matrices: F64) -> Index:
+    """How many dimensions transforms leave; a line and a point have no area to draw."""
+    sizes = np.linalg.svd(matrices[:, :, :3], compute_uv=False)
+    return np.asarray((sizes > 1e-12 * np.maximum(sizes[:, :1], 1e-300)).sum(axis=1) * (sizes[:, 0] > 0.0))
+
+
+# --- bounds and records ---------------------------------------------------------------------------------------------
+
+
+def bounds_of_group(group: Group) -> tuple[F64, F64]:
+    """Lowest and highest corner [m] of all places, exactly: only those whose boxes stand out are measured."""
+    points = group.part.shape.points.astype(np.float64) - group.middle
+    half = np.abs(points).max(axis=0)
+    low, high = np.empty(3), np.empty(3)
+    for axis in range(3):
+        rows = group.matrices[:, axis]
+        reach = np.abs(rows[:, :3]) @ half
+        high[axis] = _highest(rows, rows[:, 3] + reach, points)
+        low[axis] = -_highest(-rows, reach - rows[:, 3], points)
+    return low, high
+
+
+def _highest(rows: F64, at_most: F64, points: F64) -> float:
+    """The largest coordinate along one axis. `rows`: shape (N, 4) of transforms; `at_most`: shape (N,), of boxes."""
+    best = -np.inf
+    order = np.argsort(-at_most)
+    for start in range(0, len(order), _LOOKED_AT):
+        some = order[start : start + _LOOKED_AT]
+        some = some[at_most[some] > best]
+        if not len(some):
+            break
+        best = max(best, float(((rows[some, :3] @ points.T).max(axis=1) + rows[some, 3]).max()))
+    return best
+
+
+class Bodies:
+    """Meshes in frames of their own, each array made once, so that all records of a shape share it."""
+
+    def __init__(self) -> None:
+        self._points: dict[int, F32] = {}
+        self._normals: dict[int, F32 | None] = {}
+
+    def instances(self, group: Group, centre: F64) -> Instances:
+        """A group in engine world."""
+        shape = group.part.shape
+        if id(shape) not in self._points:
+            self._points[id(shape)] = (shape.points.astype(np.float64) - group.middle).astype(np.float32)
+            self._normals[id(shape)] = None if shape.normals is None else spread(shape.normals)
+        transforms = np.empty(group.matrices.shape, np.float32)
+        transforms[:, :, :3] = group.matrices[:, :, :3]
+        transforms[:, :, 3] = group.matrices[:, :, 3] - centre
+        mesh = Mesh(
+            path=group.paths[0],
+            points=self._points[id(shape)],
+            triangles=shape.triangles,
+            materials=group.part.materials,
+            normals=self._normals[id(shape)],
+            primvars=group.part.primvars,
+            double_sided=shape.double_sided,
+            closed=shape.closed,
+            static=group.static,
+            inside_out=shape.inside_out,
+        )
+        return Instances(mesh, transforms, group.paths, group.primvars)
+
