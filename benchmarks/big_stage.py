@@ -1,10 +1,12 @@
 """Seconds for the verbs that do not render, on a stage of 10,000 materials and 100,000 prims.
 
     python -m benchmarks.big_stage [--materials 10000] [--prims 100000] [--glass 10] [--verbs inspect,validate]
+    python -m benchmarks.big_stage --instances 1000000 [--kind leaf|crystal] [--around 32] [--picture OUT.png]
 
 Every mesh is a closed box of 12 triangles; one material in `--glass` is glass. Each verb runs in a process of its
 own, from its start to its last word. Beside it stands what usd-core alone takes for the same stage: open it, ask
-every prim for its place and every mesh for its material, read the glass, and do nothing with it.
+every prim for its place and every mesh for its material, read the glass, and do nothing with it. `--instances` is
+another stage, of one mesh in many places, and is drawn (`benchmarks.instanced`).
 """
 
 from __future__ import annotations
@@ -20,6 +22,8 @@ from pathlib import Path
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
 
 import schemas
+
+from . import instanced
 
 VERBS = {
     "inspect": ["inspect", "STAGE", "--json"],
@@ -154,7 +158,14 @@ def main() -> None:
     parser.add_argument("--prims", type=int, default=100_000)
     parser.add_argument("--glass", type=int, default=10, help="one material in so many is glass")
     parser.add_argument("--verbs", default="inspect,validate")
+    parser.add_argument("--instances", type=int, default=0, help="places of one mesh; the rest is then left out")
+    parser.add_argument("--kind", choices=instanced.KINDS, default=instanced.KINDS[0])
+    parser.add_argument("--around", type=int, default=32, help="meridians of that mesh; 32 are 960 triangles")
+    parser.add_argument("--picture", default="", help="where to save it")
     arguments = parser.parse_args()
+    if arguments.instances:
+        instanced.run(arguments.instances, arguments.kind, arguments.around, arguments.picture)
+        return
     with tempfile.TemporaryDirectory() as folder:
         stage = Path(folder) / "big.usdc"
         make(stage, arguments.materials, arguments.prims, arguments.glass)

@@ -8,6 +8,7 @@ Every record pickles.
 from __future__ import annotations
 
 import math
+import re
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -198,6 +199,11 @@ class Run(NamedTuple):
         middle = (str(n) + piece for n, piece in zip(self.numbers[row].tolist(), self.pieces[1:], strict=True))
         return self.pieces[0] + "".join(middle)
 
+    def has(self, path: str) -> bool:
+        """One of them is it."""
+        found = re.fullmatch("([0-9]{1,9})".join(map(re.escape, self.pieces)), path)
+        return found is not None and bool((self.numbers == np.array(found.groups(), np.int64)).all(axis=1).any())
+
 
 @dataclass(frozen=True)
 class Paths(Sequence[str]):
@@ -234,6 +240,9 @@ class Paths(Sequence[str]):
                 yield run
             else:
                 yield from (run.path(row) for row in range(len(run.numbers)))
+
+    def __contains__(self, path: object) -> bool:
+        return any(path == run if isinstance(run, str) else run.has(str(path)) for run in self.runs)
 
     def owners(self) -> Iterator[tuple[str, int]]:
         """The prims they belong to (`prim_of`), in order, and how many of them do."""

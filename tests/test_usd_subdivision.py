@@ -764,8 +764,8 @@ def test_a_dense_cage_takes_fewer_steps_and_says_so() -> None:
     assert at[side + 2] == pytest.approx((1.0, 1.0, 0.0), abs=1e-5)
 
 
-def test_many_instances_are_coarser_together() -> None:
-    """1000 times 32 x 32 quads would be 32 million triangles."""
+def test_instances_of_one_surface_are_as_fine_as_it() -> None:
+    """1000 times 32 x 32 quads would be 32 million triangles, but they stand there once."""
     places = ", ".join(f"({i}, 0, 0)" for i in range(1000))
     text = f"""def PointInstancer "I" {{
         rel prototypes = </I/P>
@@ -773,8 +773,18 @@ def test_many_instances_are_coarser_together() -> None:
         point3f[] positions = [{places}]
         def Xform "P" {{ {MESH(*grid(32))} }} }}"""
     scene = read(text)
-    assert len(scene.meshes) == 1000
-    assert len(scene.meshes[0].triangles) == 2 * 32 * 32
+    (many,) = scene.instances
+    (alone,) = read(MESH(*grid(32))).meshes
+    assert (len(many), len(scene.meshes)) == (1000, 0)
+    assert len(many.mesh.triangles) == len(alone.triangles)
+    assert not any("4,000,000 of all" in notice.text for notice in scene.notices)
+
+
+def test_many_surfaces_are_coarser_together() -> None:
+    """200 times 32 x 32 quads, in four pieces each twice, would be 6.5 million triangles."""
+    scene = read("".join(MESH(*grid(32), name=f"M{i}") for i in range(200)))
+    assert len(scene.meshes) == 200
+    assert len(scene.meshes[0].triangles) < 2 * 128 * 128
     assert any("4,000,000 of all" in notice.text for notice in scene.notices)
 
 

@@ -12,6 +12,7 @@ from ..models import Model
 from ..progress import Report
 from ..scene import Notice, Scene
 from ..settings import AS_IT_IS, QUALITIES, Opening, RenderSettings
+from ..world.instances import apart
 from .compare_numbers import Contrast, Findings, Mask, find, glass_of
 from .compare_report import Account, Pictures, check_folder, write_account
 from .orders import check_range, stop_if
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from .suggest import Suggestion
 
 SAMPLES = (1, 4096)
+_MOST_APART = 1 << 21
+"""Triangles that instances may have together for each of them to be judged by itself."""
 STATE = "nothing was written"
 
 
@@ -111,7 +114,11 @@ def compare_stage(order: CompareOrder, report: Report, cancel: Callable[[], bool
     settings = chosen_settings(read_settings(stage, order.settings_prim, notices), order.overrides)
     if order.suggest and settings.model:
         raise UsageError(f"the stage's RenderSettings choose the model '{settings.model}'; --suggest needs none")
-    read = partial(scene_from_stage, time_code=order.time_code, purposes=settings.purposes, camera=settings.camera)
+    reader = partial(scene_from_stage, time_code=order.time_code, purposes=settings.purposes, camera=settings.camera)
+
+    def read(stage: Any) -> Scene:
+        return apart(reader(stage), _MOST_APART)
+
     scene = read(stage)
     drawn = _draw(order, scene, settings, report, cancel)
     notices += [*drawn.frame.notices, *_only_of_reference(drawn)]

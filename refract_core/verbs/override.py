@@ -124,13 +124,15 @@ def _range_of(field: str) -> str:
 def _rows(scene: Scene, path: str) -> list[int]:
     """Rows of the material table that a path means. One material of the stage may have several."""
     rows = {int(row) for mesh in scene.meshes if mesh.path == path for row in set(mesh.materials.tolist())}
+    found = (many.mesh for many in scene.instances if path in many.paths)
+    rows |= {int(row) for mesh in found for row in set(mesh.materials.tolist())}
     rows |= {sphere.material for sphere in scene.spheres if sphere.path == path}
     names = {scene.materials[row].name for row in rows} or {path}
     return [row for row, material in enumerate(scene.materials) if material.name in names]
 
 
 def _close(scene: Scene, path: str) -> str:
-    things: Iterable[Any] = (*scene.meshes, *scene.spheres)
+    things: Iterable[Any] = (*scene.meshes, *scene.spheres, *(many.mesh for many in scene.instances))
     known = {material.name for material in scene.materials} | {thing.path for thing in things}
     found = difflib.get_close_matches(path, sorted(known), 3, cutoff=0.8)
     return f"; did you mean {' or '.join(found)}?" if found else "; `refract inspect` lists the glass of a stage"

@@ -53,13 +53,15 @@ def find_owners(scene: Scene, settings: RenderSettings, cancel: Callable[[], boo
     """
     from ..rendering.picture import render
 
-    things: tuple[Mesh | Sphere, ...] = (*scene.meshes, *scene.spheres)
+    # Instances that are too many to be told apart have one owner, by the path of the first.
+    things: tuple[Mesh | Sphere, ...] = (*scene.meshes, *scene.spheres, *(many.mesh for many in scene.instances))
     every = tuple(dict.fromkeys(owner for thing in things for owner in _of(thing, scene)))
     row_of = {owner: len(scene.materials) + number for number, owner in enumerate(every)}
     numbered = replace(
         scene,
         meshes=tuple(_mesh(mesh, scene, row_of) for mesh in scene.meshes),
         spheres=tuple(_sphere(ball, scene, row_of) for ball in scene.spheres),
+        instances=tuple(replace(many, mesh=_mesh(many.mesh, scene, row_of)) for many in scene.instances),
         materials=(*map(_black, scene.materials), *(_glowing(number + 1.0) for number in range(len(every)))),
         lights=(),
         environment=None,

@@ -154,6 +154,7 @@ def _things(scene: Scene, name: str) -> Iterator[Mesh | Sphere]:
     rows = [row for row, material in enumerate(scene.materials) if material.name == name]
     yield from (mesh for mesh in scene.meshes if np.isin(mesh.materials, rows).any())
     yield from (ball for ball in scene.spheres if ball.material in rows)
+    yield from (many.mesh for many in scene.instances if np.isin(many.mesh.materials, rows).any())
 
 
 def _places(drawn: Drawn, name: str) -> dict[str, Mask]:
@@ -281,7 +282,9 @@ def _with_primvars(scene: Scene, name: str, measured: Scene) -> Scene:
 
     meshes = tuple(taken(one, other) for one, other in zip(scene.meshes, measured.meshes, strict=True))
     spheres = tuple(taken(one, other) for one, other in zip(scene.spheres, measured.spheres, strict=True))
-    return replace(scene, meshes=meshes, spheres=spheres)
+    both = zip(scene.instances, measured.instances, strict=True)
+    instances = tuple(replace(one, mesh=taken(one.mesh, other.mesh)) for one, other in both)
+    return replace(scene, meshes=meshes, spheres=spheres, instances=instances)
 
 
 def _judged(candidate: Candidate, frame: Frame, drawn: Drawn, places: dict[str, Mask], unit: float) -> Trial:

@@ -92,6 +92,18 @@ def flat(scene: Scene, most: int) -> Scene:
     return replace(scene, meshes=scene.meshes + meshes, instances=())
 
 
+def apart(scene: Scene, most: int) -> Scene:
+    """The scene with instances as meshes, as far as they have together no more triangles than so many."""
+    meshes, kept = list(scene.meshes), []
+    for many in scene.instances:
+        if (size := len(many) * len(many.mesh.triangles)) <= most:
+            most -= size
+            meshes.extend(placed(many, k) for k in range(len(many)))
+        else:
+            kept.append(many)
+    return replace(scene, meshes=tuple(meshes), instances=tuple(kept)) if scene.instances else scene
+
+
 def around(many: Instances, point: Iterable[float]) -> list[int]:
     """Which of a closed mesh's places go round a point [m]."""
     at, mesh = np.array(tuple(point), np.float64), many.mesh

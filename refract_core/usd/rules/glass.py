@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ...models import SHEET, SOLID, Behind, Model, model_for
 from ...scene import F64, Material, Mesh, Param, Scene, Source, Sphere
+from ...world.instances import flat
 from ...world.solid import encloses, is_convex
 from ..geometry.shapes import INWARDS, TURN
 from .findings import ERROR, WARNING, Finding, Rule
@@ -24,6 +25,8 @@ _MANY = 50.0
 """Two units differ much where one is so many times the other."""
 _AGREES = 2.0
 """A thickness fits a body up to this factor, once its unit is put right."""
+_MOST_OF_ONE = 64
+"""Instances of one mesh that are looked at."""
 _UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001}
 
 OPEN = Rule("refract.sphere-on-open", ERROR, "The sphere model stands on a closed mesh.")
@@ -70,7 +73,8 @@ class Glass(NamedTuple):
 
 
 def glass_of(scene: Scene) -> list[Glass]:
-    """Every piece of glass of a scene, in its order."""
+    """Every piece of glass of a scene, in its order; of very many of one mesh, an even choice."""
+    scene = flat(scene, _MOST_OF_ONE)
     refractive = [material.refractive for material in scene.materials]
     found = []
     for mesh in scene.meshes:

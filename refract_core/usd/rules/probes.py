@@ -11,6 +11,7 @@ from pxr import Usd
 from ...probes.digest import stale_bakes
 from ...scene import F64, Probe, Scene, Volume
 from ...version import __version__
+from ...world.instances import around, placed
 from ...world.solid import encloses
 from .findings import ERROR, INFO, WARNING, Finding, Rule
 from .glass import Glass
@@ -98,7 +99,8 @@ def _standing(probe: Probe, scene: Scene, glass: list[Glass]) -> Iterator[Findin
 
 def _solids_at(scene: Scene, point: F64) -> Iterator[tuple[str, Callable[[F64], bool]]]:
     """Closed objects round a point, each with a test of whether it holds another."""
-    for mesh in scene.meshes:
+    around_it = [placed(many, k) for many in scene.instances if many.mesh.closed for k in around(many, point)]
+    for mesh in (*scene.meshes, *around_it):
         if mesh.closed and encloses(mesh.points, mesh.triangles, point):
             yield mesh.path, lambda at, m=mesh: encloses(m.points, m.triangles, at)  # type: ignore[misc]
     for ball in scene.spheres:

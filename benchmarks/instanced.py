@@ -1,0 +1,169 @@
+"""A stage of one mesh in very many places: seconds to load it, what a place costs, and the first and second frame.
+
+    python -m benchmarks.big_stage --instances 1000000 [--kind leaf|crystal] [--around 32]
+
+`leaf` is an opaque globe in random places, turned and unevenly scaled; `crystal` is one of glass, on the rings of a
+chandelier. Each size runs in a process of its own, with a tenth of the places beside it, so that what a place costs is
+a difference of two.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, Vt
+
+KINDS = ("leaf", "crystal")
+
+
+def globe(around: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Points and triangles of a unit globe with so many meridians, wound outward: 2 around (around / 2 - 1) of them."""
+    rings = around // 2
+    a, b = np.pi * np.arange(1, rings) / rings, 2 * np.pi * np.arange(around) / around
+    x, y, z = np.outer(np.sin(a), np.cos(b)), np.cos(a)[:, None], -np.outer(np.sin(a), np.sin(b))
+    grid = np.stack(np.broadcast_arrays(x, y, z), axis=2)
+    points = np.concatenate([[[0, 1, 0]], grid.reshape(-1, 3), [[0, -1, 0]]]).astype(np.float32)
+    i, j = np.arange(around), (np.arange(around) + 1) % around
+    last, first = len(points) - 1, 1 + (rings - 2) * around
+    faces = [np.stack([0 * i, 1 + i, 1 + j], 1), np.stack([first + i, 0 * i + last, first + j], 1)]
+    for ring in range(rings - 2):
+        p, q = 1 + ring * around + i, 1 + ring * around + j
+        faces += [np.stack([p, p + around, q + around], 1), np.stack([p, q + around, q], 1)]
+    return points, np.concatenate(faces).astype(np.int32)
+
+
+def make(path: Path, count: int, kind: str, around: int) -> int:
+    """Write the stage. Returns the triangles of its mesh."""
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    rng = np.random.default_rng(0)
+    instancer = UsdGeom.PointInstancer.Define(stage, "/Many")
+    points, faces = globe(around)
+    if kind == "leaf":
+        side = count ** (1 / 3) * 1.5
+        positions, scales = rng.uniform(-side / 2, side / 2, (count, 3)), rng.uniform(0.5, 1.2, (count, 3))
+    else:
+        ring = rng.integers(0, 12, count)
+        angle, radius = rng.uniform(0, 2 * math.pi, count), 0.25 + 0.06 * ring
+        positions = np.stack([radius * np.cos(angle), 1.6 - 0.09 * ring + rng.uniform(-0.05, 0.05, count),
+                              radius * np.sin(angle)], 1)  # fmt: skip
+        scales = rng.uniform(0.02, 0.035, (count, 3)) * (0.6, 1.4, 0.6)
+    turns = rng.normal(size=(count, 4))
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    instancer.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(positions.astype(np.float32)))
+    instancer.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(scales.astype(np.float32)))
+    instancer.CreateOrientationsAttr(Vt.QuathArray([Gf.Quath(*turn) for turn in turns.tolist()]))
+    instancer.CreateProtoIndicesAttr(Vt.IntArray.FromNumpy(np.zeros(count, np.int32)))
+    mesh = UsdGeom.Mesh.Define(stage, "/Many/One")
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points * np.float32(0.5)))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(faces).reshape(-1)))
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    instancer.CreatePrototypesRel().AddTarget(mesh.GetPath())
+    if kind == "crystal":
+        _dress(stage, mesh.GetPrim())
+    stage.GetRootLayer().Save()
+    return len(faces)
+
+
+def _dress(stage: Usd.Stage, mesh: Usd.Prim) -> None:
+    """Glass, a floor and a wall behind it, a lamp within it and a sky."""
+    material = UsdShade.Material.Define(stage, "/Glass")
+    shader = UsdShade.Shader.Define(stage, "/Glass/Surface")
+    shader.CreateIdAttr("UsdPreviewSurface")
+    for name, value in (("opacity", 0.0), ("ior", 1.52), ("roughness", 0.0)):
+        shader.CreateInput(name, Sdf.ValueTypeNames.Float).Set(value)
+    material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
+    UsdShade.MaterialBindingAPI.Apply(mesh).Bind(material)
+    room = UsdGeom.Mesh.Define(stage, "/Room")
+    room.CreatePointsAttr([(-3, 0, 3), (3, 0, 3), (3, 0, -2), (-3, 0, -2), (3, 3, -2), (-3, 3, -2)])
+    room.CreateFaceVertexCountsAttr([4, 4])
+    room.CreateFaceVertexIndicesAttr([0, 1, 2, 3, 3, 2, 4, 5])
+    room.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    room.CreateDisplayColorAttr([(0.35, 0.2, 0.15)])
+    lamp = UsdLux.SphereLight.Define(stage, "/Lamp")
+    lamp.CreateRadiusAttr(0.06)
+    lamp.CreateIntensityAttr(60.0)
+    UsdGeom.XformCommonAPI(lamp).SetTranslate(Gf.Vec3d(0, 1.3, 0))
+    UsdLux.DomeLight.Define(stage, "/Sky").CreateIntensityAttr(0.4)
+    camera = UsdGeom.Camera.Define(stage, "/Camera")
+    camera.CreateClippingRangeAttr(Gf.Vec2f(0.05, 100.0))
+    UsdGeom.XformCommonAPI(camera).SetTranslate(Gf.Vec3d(0, 1.15, 4.0))
+
+
+def measure(path: str, picture: str) -> None:
+    """One process: prints seconds and the growth of its memory, load, tables, first and second frame."""
+    import refract_core as rc
+    from refract_core.usd.stage import load_stage
+    from refract_core.world.instances import settled
+    from refract_core.world.tables import pack_geometry
+
+    settings = rc.RenderSettings(image_width=480, image_height=360, samples=4)
+
+    def now() -> tuple[float, float]:
+        return time.perf_counter(), time.process_time()
+
+    def told(what: str, since: tuple[float, float]) -> None:
+        passed, computed = (after - before for after, before in zip(now(), since, strict=True))
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        held = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE") / 2**20
+        print(f"{what} {passed:.2f} {computed:.2f} {held:.0f} {peak:.0f}", flush=True)
+
+    since = now()
+    scene = load_stage(path)
+    told("load", since)
+    since = now()
+    tables = pack_geometry(settled(scene))
+    told("tables", since)
+    del tables
+    for frame in ("first", "second"):
+        since = now()
+        drawn = rc.render(scene, settings)
+        told(frame, since)
+        if picture:
+            drawn.save(picture)
+
+
+def run(count: int, kind: str, around: int, picture: str) -> None:
+    """Print the table."""
+    with tempfile.TemporaryDirectory() as folder:
+        found: dict[int, dict[str, list[float]]] = {}
+        for places in (max(10, count // 10), count):
+            stage = Path(folder) / f"{places}.usdc"
+            triangles = make(stage, places, kind, around)
+            command = [sys.executable, "-m", "benchmarks.instanced", str(stage), picture if places == count else ""]
+            done = subprocess.run(command, capture_output=True, text=True, check=True)
+            rows = (line.split() for line in done.stdout.splitlines())
+            found[places] = {name: [float(number) for number in numbers] for name, *numbers in rows}
+    few, many = found
+    print(f"{count} places of a {kind} of {triangles} triangles")
+    print(f"{'':<8} {'seconds':>8} {'of CPU':>8} {'MiB held':>9} {'MiB peak':>9}")
+    for name, (passed, computed, held, peak) in found[many].items():
+        print(f"{name:<8} {passed:8.2f} {computed:8.2f} {held:9.0f} {peak:9.0f}")
+    for step, what, column in (("load", "at its peak", 3), ("tables", "held", 2), ("second", "at the peak", 3)):
+        grown = (found[many][step][column] - found[few][step][column]) * 2**20 / (many - few)
+        print(f"{step:<8} {grown:8.0f} bytes {what} for each place")
+
+
+def main() -> None:
+    """A process of `run`."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("stage")
+    parser.add_argument("picture")
+    arguments = parser.parse_args()
+    measure(arguments.stage, arguments.picture)
+
+
+if __name__ == "__main__":
+    main()
