@@ -281,6 +281,25 @@ class Instances:
         return len(self.transforms)
 
 
+@dataclass(frozen=True)
+class Balls:
+    """Many exact spheres of one material, each of which is a thing of its own: droplets, bubbles, points."""
+
+    centres: F32
+    """shape (N, 3) [m]"""
+    radii: F32
+    """shape (N,) [m], > 0"""
+    material: int
+    paths: Paths
+    """N of them"""
+    primvars: dict[str, F32] = field(default_factory=dict)
+    """name -> shape (N, D), or (1, 1, D) where all have the same"""
+    static: bool = True
+
+    def __len__(self) -> int:
+        return len(self.radii)
+
+
 class LightKind(IntEnum):
     """The kinds of light: how each shines is its row in `world.lights`, how its size is read one in `usd.lights.read`.
     The value is what kernels see."""
@@ -528,3 +547,5 @@ class Scene:
     notices: tuple[Notice, ...] = ()
     instances: tuple[Instances, ...] = ()
     """Things like the meshes; a reader makes them where there are many of one"""
+    balls: tuple[Balls, ...] = ()
+    """Things like the spheres"""

@@ -253,6 +253,7 @@ def _pack_pictures(out: str, extension: str, done: list[dict[str, Any]]) -> None
 def _check_scene(scene: Scene, limits: Mapping[str, int]) -> None:
     triangles = sum(len(mesh.triangles) for mesh in scene.meshes)
     triangles += sum(len(many) * len(many.mesh.triangles) for many in scene.instances)
+    triangles += sum(len(balls) for balls in scene.balls)
     if triangles > limits["triangles"]:
         raise Problem("limit-exceeded", f"the stage has {triangles} triangles; the limit is {limits['triangles']}")
 

@@ -92,9 +92,7 @@ def test_a_flattening_scale_keeps_what_still_has_area() -> None:
     assert "scale of 0" in texts(scene, "/C")
 
 
-@pytest.mark.parametrize(
-    "kind", ["NurbsCurves", "Points", "NurbsPatch", "TetMesh", "Volume", "ParticleField3DGaussianSplat"]
-)
+@pytest.mark.parametrize("kind", ["NurbsCurves", "NurbsPatch", "TetMesh", "Volume", "ParticleField3DGaussianSplat"])
 def test_what_is_not_rendered_is_named_once(kind: str) -> None:
     scene = read("".join(f'def {kind} "P{i}" {{}}\n' for i in range(4)))
     about = [notice.text for notice in scene.notices if kind in notice.text]

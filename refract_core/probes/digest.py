@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..scene import (
+    Balls,
     Environment,
     Instances,
     Light,
@@ -64,6 +65,9 @@ def probe_digest(scene: Scene, probe: Probe) -> str:
     for many in scene.instances:
         if many.mesh.static or probe.mode == "realtime":
             seen.append(_instances(scene, many if wanted is None else within(many, frozenset(wanted))))
+    for balls in scene.balls:
+        if balls.static or probe.mode == "realtime":
+            seen.append(_balls(scene, balls if wanted is None else within(balls, frozenset(wanted))))
     total = hashlib.sha256()
     _feed(total, "capture", probe.capture_point, probe.clipping, probe.resolution)
     _feed(total, "background", () if probe.background is None else probe.background)
@@ -72,6 +76,7 @@ def probe_digest(scene: Scene, probe: Probe) -> str:
     # What glows lights what the probe sees, though it may not see it.
     shining = [_of_thing(scene, thing) for thing in things if any(emits[m] for m in _used(thing))]
     shining += [_instances(scene, many) for many in scene.instances if any(emits[m] for m in _used(many.mesh))]
+    shining += [_balls(scene, balls) for balls in scene.balls if emits[balls.material]]
     if any(shining):
         _feed_all(total, "glow", (one for one in shining if one))
     _feed_all(total, "lights", (_remembered(light, _light) for light in scene.lights))
@@ -194,6 +199,20 @@ def _instances(scene: Scene, many: Instances) -> bytes:
     order = np.lexsort(rows.view(np.uint32).T)
     total = hashlib.sha256()
     _feed(total, "instances", mesh, *names, rows[order])
+    return total.digest()
+
+
+def _balls(scene: Scene, balls: Balls) -> bytes:
+    """Digest of many spheres, in whatever order; empty where they are glass, or none."""
+    material = scene.materials[balls.material]
+    if material.refractive or not len(balls):
+        return b""
+    names = sorted(set(_primvars_of(material)) & balls.primvars.keys())
+    every = {name: balls.primvars[name].reshape(-1, balls.primvars[name].shape[-1]) for name in names}
+    values = [np.broadcast_to(value, (len(balls), value.shape[1])) for value in every.values()]
+    rows = np.ascontiguousarray(np.concatenate([balls.centres, balls.radii[:, None], *values], axis=1), np.float32)
+    total = hashlib.sha256()
+    _feed(total, "balls", _material(scene, balls.material), *names, rows[np.lexsort(rows.view(np.uint32).T)])
     return total.digest()
 
 

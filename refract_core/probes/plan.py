@@ -152,6 +152,13 @@ def _glass(scene: Scene) -> _Glass:
             low, high = boxes(many, many.mesh.points[corners].astype(np.float64))
             found.append((first + np.arange(len(many)), low, high, np.full(len(many), longest)))
         first += len(many)
+    for balls in scene.balls:
+        if refractive[balls.material] and len(balls):
+            centres, radii = balls.centres.astype(np.float64), balls.radii[:, None].astype(np.float64)
+            longest = _longest_thickness(scene, [balls.material])
+            each = first + np.arange(len(balls)), centres - radii, centres + radii, np.full(len(balls), longest)
+            found.append(each)
+        first += len(balls)
     return _Glass(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 
@@ -163,6 +170,9 @@ def seen_things(scene: Scene, probe: Probe) -> frozenset[str]:
     for many in scene.instances:
         if many.mesh.static or not baked:
             here.update(owner for owner, _ in many.paths.owners())
+    for balls in scene.balls:
+        if balls.static or not baked:
+            here.update(owner for owner, _ in balls.paths.owners())
     return frozenset(here if probe.captured is None else here & set(probe.captured))
 
 

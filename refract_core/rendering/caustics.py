@@ -30,7 +30,7 @@ from ..world.caustics import (
 )
 from ..world.instances import around, instances_at
 from ..world.solid import across, along_a_curve, encloses
-from ..world.tables import GlassShade, World, places_of, rows_of
+from ..world.tables import GlassShade, World, balls_of, places_of, rows_of
 from .work import Work
 
 _CUT = 0.01
@@ -70,7 +70,7 @@ def _throws_caustics(world: World) -> NDArray[np.bool_]:
         refractive = own.size > 0 and bool((own != 0).all()) and not materials.cutout[used].any()
         bends = bool(np.isin(materials.drawn[used], _BENDING).all())
         if refractive and bends and not geometry.sheet[g]:
-            casts[g] = geometry.sphere[g, 3] > 0.0 or not _is_plate(world, g)
+            casts[g] = geometry.sphere[g, 3] > 0.0 or geometry.ball[g] >= 0 or not _is_plate(world, g)
     return casts
 
 
@@ -145,6 +145,9 @@ def _pieces(
             order, area = np.arange(count), np.full(count, 4.0 * math.pi * radius * radius / count)
             found.append((np.full(count, g), np.zeros(count, np.int64), order, area))
             continue
+        if world.geometry.ball[g] >= 0:
+            found.append(_patches(world, int(g)))
+            continue
         corners, transforms = _corners(world, int(g)), places_of(world.geometry, int(g))
         order = along_a_curve(corners.mean(axis=1))
         chosen, share = np.zeros(1, np.int64), 1.0
@@ -160,6 +163,22 @@ def _pieces(
     return whose, instances, primitives, sizes
 
 
+def _patches(
+    world: World, part: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], F64]:
+    """The same of many spheres."""
+    balls = balls_of(world.geometry, part).astype(np.float64)
+    chosen, count = along_a_curve(balls[:, :3]), BANDS * SECTORS
+    most = max(1, _MOST_SOURCES // count)
+    if len(chosen) > most:  # of equal area each, about
+        steps = np.cumsum(balls[chosen, 3] ** 2)
+        chosen = chosen[np.searchsorted(steps / steps[-1], (np.arange(most) + 0.5) / most)]
+    share = (balls[:, 3] ** 2).sum() / (balls[chosen, 3] ** 2).sum()
+    area = np.repeat(share * 4.0 * math.pi * balls[chosen, 3] ** 2 / count, count)
+    places = np.repeat(chosen, count)
+    return np.full(len(places), part), places, np.tile(np.arange(count), len(chosen)), area
+
+
 def _bodies_around(world: World, scene: Scene, light: int, parts: NDArray[np.int64]) -> list[int]:
     """The surfaces of bodies that a light stands in: its rays come to them from inside."""
     lamps = world.lights
@@ -172,6 +191,11 @@ def _bodies_around(world: World, scene: Scene, light: int, parts: NDArray[np.int
         if world.geometry.sphere[g, 3] > 0.0:
             if math.dist(at, world.geometry.sphere[g, :3]) < world.geometry.sphere[g, 3]:
                 found.append(surface)
+            continue
+        if world.geometry.ball[g] >= 0:
+            balls = balls_of(world.geometry, int(g)).astype(np.float64)
+            inside = np.linalg.norm(balls[:, :3] - at, axis=1) < balls[:, 3]
+            found += (surface + np.flatnonzero(inside)).tolist()
             continue
         if world.geometry.place[g] >= 0:
             found += [surface + k for k in around(instances_at(scene, thing), at)]
@@ -189,6 +213,9 @@ def _bounds(world: World, part: int) -> tuple[F64, F64]:
     ball = world.geometry.sphere[part]
     if ball[3] > 0.0:
         return ball[None, :3].astype(np.float64), ball[3:].astype(np.float64)
+    if world.geometry.ball[part] >= 0:
+        balls = balls_of(world.geometry, part).astype(np.float64)
+        return balls[:, :3], balls[:, 3]
     corners = _corners(world, part).reshape(-1, 3)
     low, high = corners.min(axis=0), corners.max(axis=0)
     places = places_of(world.geometry, part).astype(np.float64)

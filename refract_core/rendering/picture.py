@@ -219,4 +219,5 @@ def _part_of(scene: Scene, prims: frozenset[str]) -> Scene:
         meshes=tuple(mesh for mesh in scene.meshes if prim_of(mesh.path) in prims),
         spheres=tuple(ball for ball in scene.spheres if prim_of(ball.path) in prims),
         instances=tuple(some for many in scene.instances if len(some := within(many, prims))),
+        balls=tuple(left for balls in scene.balls if len(left := within(balls, prims))),
     )

@@ -232,7 +232,7 @@ def _geometry_source(scene: Scene, chosen: Plan) -> Any:
     """All that `pack_geometry` reads."""
     kinds = tuple((material.refractive, material.cutout) for material in scene.materials)
     slots = primvar_slots(scene.materials)
-    things = scene.meshes, scene.spheres, scene.instances
+    things = scene.meshes, scene.spheres, scene.instances, scene.balls
     return things, kinds, slots, tuple(chosen.captured_sets), tuple(caster_sets(scene))
 
 

@@ -24,7 +24,18 @@ from ..view.gbuffer import OpaqueLayer, add_view_ray
 from ..view.planes import Planes
 from ..world.embree import COHERENT, EVERYTHING, clear, has_hit
 from ..world.shading import entering, is_painted_alone, load_surface, paint
-from ..world.surface import NOTHING, Hit, Interaction, Ray, corners_of, hit_in, interaction, kept_hit, surface_of
+from ..world.surface import (
+    NOTHING,
+    Hit,
+    Interaction,
+    Ray,
+    corners_of,
+    hit_in,
+    interaction,
+    is_round,
+    kept_hit,
+    surface_of,
+)
 from ..world.tables import World
 from ..world.tracing import intersect_world
 from .answers import MOST_ANSWERS, Answers, add_direct, add_sky, body_light, keep_answers
@@ -377,7 +388,7 @@ def _is_painted(
 ) -> bool:
     """A texture changes the light of four answers by so much that it has to be looked at between them."""
     hit = kept_hit(answers.hits, found[0])
-    if world.materials.driven[hit.material] == 0 or world.geometry.sphere[hit.part, 3] > 0.0:
+    if world.materials.driven[hit.material] == 0 or is_round(world.geometry, hit.part):
         return False
     # Corners that lie farther apart than each of them looks may agree by chance, as on a floor that is seen edge-on.
     sides = _sides(answers, found)

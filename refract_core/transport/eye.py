@@ -47,6 +47,12 @@ def view_ray(scene: Scene, camera: Camera, model: str) -> Rays:
                 size = float(np.prod(np.ptp(placed(many, k).points, axis=0)))
                 around.append((size, first + k, filled_with))
         first += len(many)
+    for balls in scene.balls:
+        if traced[balls.material]:
+            inside = np.linalg.norm(balls.centres.astype(np.float64) - eye, axis=1) < balls.radii
+            for k in np.flatnonzero(inside).tolist():
+                around.append(((2.0 * float(balls.radii[k])) ** 3, first + k, scene.materials[balls.material]))
+        first += len(balls)
     for _, thing, material in sorted(around, key=lambda body: -body[0])[-MOST_MEDIA:]:
         r, g, b = (float(c) for c in material.inputs[Param.TRANSMITTANCE].value[:3])
         ior = max(1.0, float(material.inputs[Param.IOR].value[0]))

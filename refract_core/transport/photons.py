@@ -30,7 +30,7 @@ from ..world.environment import TEXEL_LUMINANCE, direction_pdf, irradiance, radi
 from ..world.lights import drawn_ray, irradiance_factor, is_flat
 from ..world.offsets import off_surface
 from ..world.shaping import shape_drawn, shape_matt
-from ..world.surface import NOTHING, Interaction, Ray, corners_of, interaction, kept_hit, sense_of
+from ..world.surface import NOTHING, Interaction, Ray, ball_of, corners_of, interaction, is_round, kept_hit, sense_of
 from ..world.tables import World
 from ..world.tracing import add_shadow_ray, visible
 from .crossing import PASSED, Rules, meet, send_mirrored, send_out, send_past, send_through
@@ -132,13 +132,14 @@ def _from_point(world: World, light: int, p: Vec, n: Vec, direction: Vec, distan
 def _place_at(world: World, sources: Sources, e: int, a: float, b: float) -> tuple[Vec, Vec]:
     """Place and normal of a piece; `a`, `b` >= 0 are barycentric, a + b <= 1. Of a sphere's patch, they fill half."""
     geometry, part, side = world.geometry, sources.part[e], sources.side[e]
-    if geometry.sphere[part, 3] > 0.0:
+    if is_round(geometry, part):
         band, sector = sources.primitive[e] // SECTORS, sources.primitive[e] % SECTORS
         z = 2.0 * (band + a) / BANDS - 1.0
         phi = 2.0 * math.pi * (sector + b) / SECTORS
         r = math.sqrt(max(0.0, 1.0 - z * z))
         n = (r * math.cos(phi), r * math.sin(phi), z)
-        return add(row(geometry.sphere, part), scale(n, np.float64(geometry.sphere[part, 3]))), scale(n, side)
+        centre, radius = ball_of(geometry, part, sources.instance[e])
+        return add(centre, scale(n, radius)), scale(n, side)
     p, q, last = corners_of(geometry, part, sources.instance[e], sources.primitive[e])
     side *= sense_of(geometry, part, sources.instance[e])
     pq, pr = sub(q, p), sub(last, p)
@@ -148,7 +149,7 @@ def _place_at(world: World, sources: Sources, e: int, a: float, b: float) -> tup
 @inlined
 def _draw_place(world: World, sources: Sources, e: int, u1: float, u2: float) -> tuple[Vec, Vec]:
     """A place spread evenly over a piece."""
-    if world.geometry.sphere[sources.part[e], 3] > 0.0:
+    if is_round(world.geometry, sources.part[e]):
         return _place_at(world, sources, e, u1, u2)
     r = math.sqrt(u1)
     return _place_at(world, sources, e, 1.0 - r, u2 * r)

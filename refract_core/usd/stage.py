@@ -21,13 +21,14 @@ from .camera import choose_camera, read_cameras
 from .diagnostics import captured, words_of
 from .geometry.cages import FINENESS
 from .geometry.curves import cuts_for
-from .geometry.many import Bodies, Group, bounds_of_group, shared
+from .geometry.dots import Dots, read_dots, spread_dots
+from .geometry.many import Bodies, Cloud, Group, bounds_of_cloud, bounds_of_group, shared, to_balls
 from .geometry.parts import MOST_IN_ALL, Bound, Part, Tables, affordable, assemble, bind
 from .geometry.place import Placed, bounds_of, place, to_mesh, to_sphere
 from .geometry.refined import MOST_TRIANGLES, Fineness
 from .geometry.shapes import INWARDS, TURN, Shape, read_shape
 from .geometry.skel import posed
-from .geometry.traverse import Placement, refuse_too_many, some_of, walk
+from .geometry.traverse import POINTS, Placement, refuse_too_many, some_of, walk
 from .geometry.ways import with_ways
 from .layers import mtlx
 from .lights.meshes import glowing, mesh_lights
@@ -224,8 +225,8 @@ def _read(
     metres_from_stage = _upright(stage, notices) @ np.diag([metres_per_unit] * 3 + [1.0])
     tables = Tables(time, metres_per_unit, notices, FINENESS[complexity])
     drawn = walk(stage, time, purposes, notices)
-    placed, groups = _placed(stage, keep(drawn, tables) if keep else drawn, metres_from_stage, tables)
-    extent = _extent([bounds_of(placed), *(bounds_of_group(group) for group in groups)])
+    placed, groups, clouds = _placed(stage, keep(drawn, tables) if keep else drawn, metres_from_stage, tables)
+    extent = _extent([bounds_of(placed), *map(bounds_of_group, groups), *map(bounds_of_cloud, clouds)])
     if extent is None:
         notices.append(Notice("/", "nothing is visible at this time and with these purposes; the scene is empty"))
         extent = -np.ones(3), np.ones(3)
@@ -234,7 +235,8 @@ def _read(
     meshes = glowing(stage, time, meshes, tables.materials, metres_per_unit=metres_per_unit, notices=notices)
     bodies = Bodies()
     instances = tuple(bodies.instances(groups.pop(0), centre) for _ in range(len(groups)))
-    materials = with_ways(tables.materials, meshes, spheres, instances, metres_per_unit, notices)
+    balls = tuple(to_balls(cloud, centre) for cloud in clouds)
+    materials = with_ways(tables.materials, meshes, spheres, instances, balls, metres_per_unit, notices)
     engine_from_stage = metres_from_stage.copy()
     engine_from_stage[:3, 3] = -centre
     bounds = triple(extent[0] - centre), triple(extent[1] - centre)
@@ -244,23 +246,26 @@ def _read(
         "notices": notices,
     }
     still = [mesh.static for mesh in meshes] + [ball.static for ball in spheres]
-    still += [many.mesh.static for many in instances]
+    still += [many.mesh.static for many in instances] + [cloud.static for cloud in balls]
     every_camera = read_cameras(stage, time, **frame)
     cameras = choose_camera(stage, time, every_camera, camera, bounds, moving=not all(still), **frame)
     things = [prim_of(mesh.path) for mesh in meshes] + [prim_of(ball.path) for ball in spheres]
-    things += [owner for many in instances for owner, _ in many.paths.owners()]
+    every_path = [many.paths for many in instances] + [cloud.paths for cloud in balls]
+    things += [owner for some in every_path for owner, _ in some.owners()]
     paths = tuple(dict.fromkeys(things))
     lights, environment = read_lights(stage, time, purposes=purposes, drawn=paths, **frame)
     every = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
     glow = {m for m, material in enumerate(tables.materials) if material.emits}
     every_mesh = (*meshes, *(many.mesh for many in instances))
-    used = {m for mesh in every_mesh for m in np.unique(mesh.materials).tolist()} | {ball.material for ball in spheres}
+    used = {m for mesh in every_mesh for m in np.unique(mesh.materials).tolist()}
+    used |= {ball.material for ball in spheres} | {cloud.material for cloud in balls}
     lit = bool(glow & used) or any(prim.HasAPI(UsdLux.LightAPI) for prim in every)
     return Scene(
         meshes=meshes,
         materials=tuple(materials),
         spheres=spheres,
         instances=instances,
+        balls=balls,
         textures=tuple(tables.textures.values()),
         lights=lights,
         environment=environment,
@@ -321,27 +326,36 @@ def _extent(bounds: list[tuple[F64, F64] | None]) -> tuple[F64, F64] | None:
 
 def _placed(
     stage: Usd.Stage, placements: list[Placement], metres_from_stage: F64, tables: Tables
-) -> tuple[list[Placed], list[Group]]:
+) -> tuple[list[Placed], list[Group], list[Cloud]]:
     """Reads every prim once and puts it wherever it is drawn."""
     prims = list({placement.prim.GetPath(): placement.prim for placement in placements}.values())
     shapes: dict[Sdf.Path, Shape | None] = {}
     parts: dict[Sdf.Path, Part | None] = {}
+    points: dict[Sdf.Path, Dots | None] = {}
     tables.cuts = cuts_for(placements, tables.time, tables.fineness, tables.notices)
     asked, tables.fineness = tables.fineness, affordable(placements, tables.time, tables.fineness)
     for prim, bound in zip(prims, bind(prims, tables.notices), strict=True):
-        parts[prim.GetPath()] = _part(prim, bound, shapes, tables)
+        if prim.GetTypeName() == POINTS:
+            points[prim.GetPath()] = read_dots(prim, bound, tables)
+        else:
+            parts[prim.GetPath()] = _part(prim, bound, shapes, tables)
     tables.notices.extend(_coarse(parts, asked, tables.fineness))
-    tables.notices.extend(_turned(prims, parts))
+    tables.notices.extend(_turned([prim for prim in prims if prim.GetPath() in parts], parts))
     proxies = any(placement.prim.IsInstanceProxy() for placement in placements)
     own = mesh_lights(stage) if proxies else frozenset()
-    alone, groups = shared(placements, parts, own, metres_from_stage, tables)
+    solid = [placement for placement in placements if placement.prim.GetTypeName() != POINTS]
+    alone, groups, clouds = shared(solid, parts, own, metres_from_stage, tables)
+    for placement in placements:
+        if (dots := points.get(placement.prim.GetPath())) is not None:
+            for one in spread_dots(dots, placement, metres_from_stage, tables):
+                (clouds if isinstance(one, Cloud) else groups).append(one)  # type: ignore[arg-type]
     placed = []
     for placement in alone:
         part = parts[placement.prim.GetPath()]
         item = place(part, placement, metres_from_stage, tables) if part is not None else None
         if item is not None:
             placed.append(item)
-    return placed, groups
+    return placed, groups, clouds
 
 
 def _coarse(parts: dict[Sdf.Path, Part | None], asked: Fineness, used: Fineness) -> Iterator[Notice]:

@@ -126,6 +126,7 @@ def _rows(scene: Scene, path: str) -> list[int]:
     rows = {int(row) for mesh in scene.meshes if mesh.path == path for row in set(mesh.materials.tolist())}
     found = (many.mesh for many in scene.instances if path in many.paths)
     rows |= {int(row) for mesh in found for row in set(mesh.materials.tolist())}
+    rows |= {balls.material for balls in scene.balls if path in balls.paths}
     rows |= {sphere.material for sphere in scene.spheres if sphere.path == path}
     names = {scene.materials[row].name for row in rows} or {path}
     return [row for row, material in enumerate(scene.materials) if material.name in names]

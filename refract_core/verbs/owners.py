@@ -16,6 +16,7 @@ import numpy as np
 from ..models import Model
 from ..scene import I32, Material, Mesh, Param, Scene, Source, Sphere
 from ..settings import RenderSettings
+from ..world.instances import sphere
 
 NOBODY = -1
 
@@ -54,7 +55,10 @@ def find_owners(scene: Scene, settings: RenderSettings, cancel: Callable[[], boo
     from ..rendering.picture import render
 
     # Instances that are too many to be told apart have one owner, by the path of the first.
-    things: tuple[Mesh | Sphere, ...] = (*scene.meshes, *scene.spheres, *(many.mesh for many in scene.instances))
+    things: tuple[Mesh | Sphere, ...] = (
+        *scene.meshes, *scene.spheres, *(many.mesh for many in scene.instances),
+        *(sphere(balls, 0) for balls in scene.balls if len(balls)),
+    )  # fmt: skip
     every = tuple(dict.fromkeys(owner for thing in things for owner in _of(thing, scene)))
     row_of = {owner: len(scene.materials) + number for number, owner in enumerate(every)}
     numbered = replace(
@@ -62,6 +66,10 @@ def find_owners(scene: Scene, settings: RenderSettings, cancel: Callable[[], boo
         meshes=tuple(_mesh(mesh, scene, row_of) for mesh in scene.meshes),
         spheres=tuple(_sphere(ball, scene, row_of) for ball in scene.spheres),
         instances=tuple(replace(many, mesh=_mesh(many.mesh, scene, row_of)) for many in scene.instances),
+        balls=tuple(
+            replace(balls, material=_sphere(sphere(balls, 0), scene, row_of).material)
+            for balls in scene.balls if len(balls)
+        ),
         materials=(*map(_black, scene.materials), *(_glowing(number + 1.0) for number in range(len(every)))),
         lights=(),
         environment=None,

@@ -104,7 +104,7 @@ def library() -> ctypes.CDLL:
 
 
 class Part(NamedTuple):
-    """One Embree geometry: a run of triangles, in one place or in many, or one exact sphere."""
+    """One Embree geometry: a run of triangles, in one place or in many, or exact spheres."""
 
     mask: int
     triangles: NDArray[np.uint32] | None
@@ -114,6 +114,8 @@ class Part(NamedTuple):
     """centre, radius [m]"""
     transforms: NDArray[np.float32] | None = None
     """shape (N, 3, 4): the places of the triangles, whose points are in a frame of their own; None: where they are"""
+    balls: NDArray[np.float32] | None = None
+    """shape (N, 4): centres, radii [m], in place of the one sphere"""
 
 
 class Bvh:
@@ -175,8 +177,9 @@ class Bvh:
             lib.rtcSetSharedGeometryBuffer(geometry, _INDEX, 0, _UINT3, self._kept(array), 0, 12, len(array))
         else:
             geometry = lib.rtcNewGeometry(device, _SPHERE_POINT)
-            ball = np.array([part.sphere], np.float32)
-            lib.rtcSetSharedGeometryBuffer(geometry, _VERTEX, 0, _FLOAT4, self._kept(ball), 0, 16, 1)
+            some = part.balls if part.balls is not None else np.array([part.sphere])
+            balls = np.ascontiguousarray(some, np.float32)
+            lib.rtcSetSharedGeometryBuffer(geometry, _VERTEX, 0, _FLOAT4, self._kept(balls), 0, 16, len(balls))
         return int(geometry)
 
     def _apart(self, lib: ctypes.CDLL, device: int, part: Part) -> int:
@@ -221,7 +224,12 @@ def check_parts(points: NDArray[np.float32], parts: list[Part]) -> None:
     for i, part in enumerate(parts):
         t = part.triangles
         if t is None:
-            if not np.isfinite(part.sphere).all() or part.sphere[3] <= 0:
+            if part.balls is not None:
+                wrong = np.flatnonzero(~np.isfinite(part.balls).all(axis=1) | (part.balls[:, 3] <= 0))
+                if len(wrong):
+                    text = f"sphere {part.balls[wrong[0]].tolist()} must be finite with a radius above 0"
+                    raise SceneError(f"part {i}, number {wrong[0]}: {text}")
+            elif not np.isfinite(part.sphere).all() or part.sphere[3] <= 0:
                 raise SceneError(f"part {i}: sphere {part.sphere} must be finite with a radius above 0")
         elif t.ndim != 2 or t.shape[1] != 3 or t.dtype.kind not in "ui":
             raise SceneError(f"part {i}: triangles must be integers of shape (T, 3), not {t.dtype} {t.shape}")

@@ -68,7 +68,8 @@ def what_glows(world: World, scene: Scene, eye: F64) -> Glow | None:
         return None
     seen, exact = by_address(world), world.geometry.sphere[:, 3] > 0.0
     objects: dict[int, list[_Pieces]] = {}
-    alone = np.flatnonzero(world.geometry.place < 0).tolist()  # what glows in many places is settled to be alone
+    # What glows in many places has been settled to be alone.
+    alone = np.flatnonzero((world.geometry.place < 0) & (world.geometry.ball < 0)).tolist()
     parts = [part for part in alone if emits[world.geometry.material[rows_of(world.geometry, part)]].any()]
     few = exact[parts].sum() <= _MOST_LIGHTS
     balls: list[Light] = []

@@ -8,17 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene import F64, Instances, Mesh, Notice, Scene, Sphere, prim_of
+from ..scene import F64, Balls, Instances, Mesh, Notice, Scene, Sphere, prim_of
 from .solid import encloses
 
 _SOME = 1 << 16
 """Places that are looked at together."""
 _MOST_GLOWING = 1 << 21
 """Triangles that instances which glow have together, at most, to light the scene."""
+_MOST_GLOWING_BALLS = 1 << 14
+"""The same for exact spheres."""
+_TRIANGLES_OF_A_BALL = 80
 
 
 def linears(many: Instances, chosen: slice | NDArray[np.integer] = slice(None)) -> tuple[F64, F64]:
@@ -78,22 +82,37 @@ def placed(many: Instances, k: int) -> Mesh:
     )
 
 
+def sphere(balls: Balls, k: int) -> Sphere:
+    """One of many spheres by itself."""
+    x, y, z = (float(c) for c in balls.centres[k])
+    primvars = {name: v if v.ndim == 3 else v[k].reshape(1, 1, -1) for name, v in balls.primvars.items()}
+    return Sphere(balls.paths[k], (x, y, z), float(balls.radii[k]), balls.material, primvars, balls.static)
+
+
 def some_placed(many: Instances, most: int) -> Iterator[Mesh]:
     """As many as asked for, spread evenly over all of them."""
-    count = min(most, len(many))
-    return (placed(many, int(k)) for k in np.unique(np.linspace(0, len(many) - 1, count).astype(np.int64)))
+    return (placed(many, k) for k in _even(len(many), most))
+
+
+def _even(count: int, most: int) -> list[int]:
+    """At most so many numbers below `count`, evenly."""
+    chosen: list[int] = np.unique(np.linspace(0, count - 1, min(most, count)).astype(np.int64)).tolist()
+    return chosen
 
 
 def flat(scene: Scene, most: int) -> Scene:
-    """The scene with instances as meshes, at most so many of one mesh; of more, an even choice stands for all."""
-    if not scene.instances:
+    """The scene with instances as meshes and balls as spheres, at most so many of one mesh; of more, an even choice
+    stands for all."""
+    if not scene.instances and not scene.balls:
         return scene
     meshes = tuple(mesh for many in scene.instances for mesh in some_placed(many, most))
-    return replace(scene, meshes=scene.meshes + meshes, instances=())
+    spheres = tuple(sphere(balls, k) for balls in scene.balls for k in _even(len(balls), most))
+    return replace(scene, meshes=scene.meshes + meshes, spheres=scene.spheres + spheres, instances=(), balls=())
 
 
 def apart(scene: Scene, most: int) -> Scene:
-    """The scene with instances as meshes, as far as they have together no more triangles than so many."""
+    """The scene with instances as meshes and balls as spheres, as far as they have together no more triangles than so
+    many, of which a sphere counts as some."""
     meshes, kept = list(scene.meshes), []
     for many in scene.instances:
         if (size := len(many) * len(many.mesh.triangles)) <= most:
@@ -101,7 +120,17 @@ def apart(scene: Scene, most: int) -> Scene:
             meshes.extend(placed(many, k) for k in range(len(many)))
         else:
             kept.append(many)
-    return replace(scene, meshes=tuple(meshes), instances=tuple(kept)) if scene.instances else scene
+    spheres, round_ones = list(scene.spheres), []
+    for balls in scene.balls:
+        if (size := _TRIANGLES_OF_A_BALL * len(balls)) <= most:
+            most -= size
+            spheres.extend(sphere(balls, k) for k in range(len(balls)))
+        else:
+            round_ones.append(balls)
+    if not scene.instances and not scene.balls:
+        return scene
+    left = replace(scene, instances=tuple(kept), balls=tuple(round_ones))
+    return replace(left, meshes=tuple(meshes), spheres=tuple(spheres))
 
 
 def around(many: Instances, point: Iterable[float]) -> list[int]:
@@ -120,13 +149,18 @@ def around(many: Instances, point: Iterable[float]) -> list[int]:
     return found
 
 
-def take(many: Instances, chosen: NDArray[np.integer]) -> Instances:
+Many = TypeVar("Many", Instances, Balls)
+
+
+def take(many: Many, chosen: NDArray[np.integer]) -> Many:
     """Those in places, which ascend."""
-    primvars = {name: values[chosen] for name, values in many.primvars.items()}
-    return Instances(many.mesh, many.transforms[chosen], many.paths.take(chosen), primvars)
+    primvars = {name: values[chosen] if values.ndim == 2 else values for name, values in many.primvars.items()}
+    paths = many.paths.take(chosen)
+    columns = {name: getattr(many, name)[chosen] for name in ("transforms", "centres", "radii") if hasattr(many, name)}
+    return replace(many, paths=paths, primvars=primvars, **columns)
 
 
-def within(many: Instances, prims: frozenset[str]) -> Instances:
+def within(many: Many, prims: frozenset[str]) -> Many:
     """Those that belong to some prims."""
     kept = [(owner in prims, count) for owner, count in many.paths.owners()]
     if all(keep for keep, _ in kept):
@@ -140,9 +174,10 @@ def within(many: Instances, prims: frozenset[str]) -> Instances:
 def settled(scene: Scene) -> Scene:
     """The scene as rays can meet it: what glows in many places are meshes, as each of its triangles is a light; and
     instances that collections tell apart, of what a probe sees or a light lights, are apart."""
-    if not scene.instances:
+    if not scene.instances and not scene.balls:
         return scene
     meshes, kept, notices = list(scene.meshes), [], list(scene.notices)
+    spheres, round_ones = list(scene.spheres), []
     left = _MOST_GLOWING
     for many in scene.instances:
         if not _glows(many, scene):
@@ -154,9 +189,25 @@ def settled(scene: Scene) -> Scene:
             text = f"its {len(many)} instances glow, but light nothing: they have {size} triangles together, and what "
             notices.append(Notice(many.paths[0], f"{text}glows in many places may have {_MOST_GLOWING}"))
             kept.append(many)
+    for balls in scene.balls:
+        material = scene.materials[balls.material]
+        if not material.emits or material.refractive:
+            round_ones.append(balls)
+        elif len(balls) <= _MOST_GLOWING_BALLS:
+            spheres.extend(sphere(balls, k) for k in range(len(balls)))
+        else:
+            text = f"its {len(balls)} spheres glow, but light nothing: at most {_MOST_GLOWING_BALLS} do"
+            notices.append(Notice(balls.paths[0], text))
+            round_ones.append(balls)
     told = [frozenset(paths) for paths in _collections(scene)]
-    apart = [one for many in kept for one in (_apart(many, told) if told else [many])]
-    return replace(scene, meshes=tuple(meshes), instances=tuple(apart), notices=tuple(notices))
+    return replace(
+        scene,
+        meshes=tuple(meshes),
+        spheres=tuple(spheres),
+        instances=tuple(one for many in kept for one in (_apart(many, told) if told else [many])),
+        balls=tuple(one for many in round_ones for one in (_apart(many, told) if told else [many])),
+        notices=tuple(notices),
+    )
 
 
 def _glows(many: Instances, scene: Scene) -> bool:
@@ -170,8 +221,8 @@ def _collections(scene: Scene) -> Iterator[tuple[str, ...]]:
     return (paths for paths in dict.fromkeys(said) if paths is not None)
 
 
-def _apart(many: Instances, collections: list[frozenset[str]]) -> list[Instances]:
-    """Instances by the collections that they are in."""
+def _apart(many: Many, collections: list[frozenset[str]]) -> list[Many]:
+    """Instances, or balls, by the collections that they are in."""
     numbers: dict[tuple[bool, ...], int] = {}
     kinds, counts = [], []
     for owner, count in many.paths.owners():
@@ -184,8 +235,8 @@ def _apart(many: Instances, collections: list[frozenset[str]]) -> list[Instances
 
 
 def thing_count(scene: Scene) -> int:
-    """Things that have a number: meshes, spheres, and every instance."""
-    return len(scene.meshes) + len(scene.spheres) + sum(map(len, scene.instances))
+    """Things that have a number: meshes, spheres, every instance, and every ball."""
+    return len(scene.meshes) + len(scene.spheres) + sum(map(len, scene.instances)) + sum(map(len, scene.balls))
 
 
 def instances_at(scene: Scene, thing: int) -> Instances:
@@ -202,6 +253,6 @@ def paths_of(scene: Scene) -> Iterator[tuple[str, int]]:
     """Prims that things belong to (`scene.prim_of`), in the order of their numbers, and how many in a row do."""
     alone: tuple[Mesh | Sphere, ...] = (*scene.meshes, *scene.spheres)
     yield from ((prim_of(thing.path), 1) for thing in alone)
-    for many in scene.instances:
-        yield from many.paths.owners()
+    for paths in [many.paths for many in scene.instances] + [balls.paths for balls in scene.balls]:
+        yield from paths.owners()
 

@@ -83,6 +83,8 @@ def hit_in(packet: Packet, lane: int, geometry: Geometry) -> Hit:
     part, primitive, instance = words[GEOM, lane], words[PRIM, lane], words[INST_PRIM, lane]
     if words[INST, lane] >= 0:  # what stands in many places has a scene of its own, whose only geometry is 0
         part = words[INST, lane]
+    elif geometry.ball[part] >= 0:  # each of many spheres is a place
+        instance, primitive = primitive, instance & 0
     else:
         instance &= 0
     return Hit(
@@ -123,6 +125,21 @@ def thing_of(geometry: Geometry, hit: Hit) -> int:
 def surface_of(geometry: Geometry, hit: Hit) -> int:
     """Number of the surface that was hit: a part, in one of its places."""
     return geometry.surface[hit.part] + hit.instance
+
+
+@inlined
+def is_round(geometry: Geometry, part: int) -> bool:
+    """A part is exact spheres, or one."""
+    return geometry.sphere[part, 3] > 0.0 or geometry.ball[part] >= 0
+
+
+@inlined
+def ball_of(geometry: Geometry, part: int, instance: int) -> tuple[Vec, float]:
+    """Centre and radius [m] of a sphere."""
+    k = geometry.ball[part]
+    if k >= 0:
+        return row(geometry.balls, k + instance), np.float64(geometry.balls[k + instance, 3])
+    return row(geometry.sphere, part), np.float64(geometry.sphere[part, 3])
 
 
 @inlined
@@ -181,6 +198,20 @@ def drawn_model(world: World, hit: Hit) -> int:
 
 
 @inlined
+def _exact_normal(centre: Vec, radius: float, ray: Ray, t: float) -> Vec:
+    """Where a ray meets a sphere near a distance: a droplet is so small that the distance alone, rounded to float32,
+    would turn its normal."""
+    to = sub(ray.origin, centre)
+    near = -dot(to, ray.direction)
+    beside = along(to, ray.direction, near)
+    left = radius * radius - dot(beside, beside)
+    if left <= 0.0:
+        return normalize(beside)
+    half = math.sqrt(left)
+    return normalize(along(beside, ray.direction, half if t > near else -half))
+
+
+@inlined
 def interaction(geometry: Geometry, hit: Hit, ray: Ray, footprint: float) -> Interaction:
     """Point and normals of a hit. `footprint`: width of the ray's cone there [m], for texture filtering.
 
@@ -188,10 +219,12 @@ def interaction(geometry: Geometry, hit: Hit, ray: Ray, footprint: float) -> Int
     where origin plus distance is only as good as the distance.
     """
     part, u, v = hit.part, hit.u, hit.v
-    if geometry.sphere[part, 3] > 0.0:
-        centre = row(geometry.sphere, part)
+    if is_round(geometry, part):
+        centre, radius = ball_of(geometry, part, hit.instance)
         ng = normalize(sub(along(ray.origin, ray.direction, hit.t), centre))
-        point = along(centre, ng, np.float64(geometry.sphere[part, 3]))
+        if geometry.ball[part] >= 0:
+            ng = _exact_normal(centre, radius, ray, hit.t)
+        point = along(centre, ng, radius)
         ns = ng
     else:
         a, b, c = corners_of(geometry, part, hit.instance, hit.primitive)
@@ -280,7 +313,7 @@ def _primvar4(geometry: Geometry, hit: Hit, slot: int) -> tuple[bool, Rgba]:
 def _uv_density(geometry: Geometry, hit: Hit, slot: int) -> float:
     """Texture lengths per metre on the hit triangle: the square root of the ratio of areas."""
     stride = geometry.primvar_stride[hit.part, slot]
-    if stride == 0 or geometry.sphere[hit.part, 3] > 0.0:
+    if stride == 0 or is_round(geometry, hit.part):
         return 0.0
     a, b, c = corners_of(geometry, hit.part, hit.instance, hit.primitive)
     area = length(cross(sub(b, a), sub(c, a)))
@@ -384,7 +417,7 @@ def normal_input(world: World, at: Interaction) -> Vec:
     i = Param.NORMAL.value
     m = hit.material
     slot = materials.uv_slot[m, i]
-    if materials.texture[m, i] < 0 or slot < 0 or geometry.sphere[hit.part, 3] > 0.0:
+    if materials.texture[m, i] < 0 or slot < 0 or is_round(geometry, hit.part):
         return at.ns
     stride = geometry.primvar_stride[hit.part, slot]
     if geometry.primvar_first[hit.part, slot] < 0 or stride == 0:

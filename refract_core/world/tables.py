@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..errors import SceneError
 from ..kernels.arrays import F32_1D, F32_2D, F32_3D, I32_1D, I32_2D, I32_3D, I64_1D, I64_2D, U8_1D, U32_2D
 from ..models import BY_TOKEN
-from ..scene import Instances, LightKind, Material, Mesh, Model, Param, Scene, Source, Sphere, prim_of
+from ..scene import Balls, Instances, LightKind, Material, Mesh, Model, Param, Scene, Source, Sphere, prim_of
 from . import embree
 from .bounced import Bounced, no_bounced
 from .caustics import Caustics, no_caustics
@@ -57,9 +57,13 @@ class Geometry(NamedTuple):
     transforms: F32_3D
     """shape (P, 3, 4): engine world from a part's own frame"""
     sphere: F32_2D
-    """shape (G, 4): centre, radius [m]; radius 0 for triangles"""
+    """shape (G, 4): centre, radius [m]; radius 0 for triangles, and for many spheres"""
+    ball: I64_1D
+    """shape (G,): row of the first of many spheres in `balls`, each of which is one of its places; -1 for others"""
+    balls: F32_2D
+    """shape (B, 4): centre, radius [m]"""
     thing: I32_1D
-    """shape (G,): index of the prim, meshes first, then spheres, then instances; a part's further places follow"""
+    """shape (G,): index of the prim, meshes first, then spheres, instances, balls; a part's further places follow"""
     surface: I32_1D
     """shape (G,): number of a part's surface; those of its further places follow"""
     sheet: U8_1D
@@ -245,11 +249,12 @@ class _Pile:
         self.normals: list[NDArray[np.float32]] = []
         self.primvars: list[NDArray[np.float32]] = []
         self.transforms: list[NDArray[np.float32]] = []
-        self.rows: list[tuple[int, int, int, int, tuple[float, ...], int, int, bool, int]] = []
+        self.rows: list[tuple[int, int, int, int, int, tuple[float, ...], int, int, bool, int]] = []
         self.primvar_rows: list[list[tuple[int, int, int, int]]] = []
         self.bounds: list[tuple[Any, Any]] = []
         self.point_count = self.triangle_count = self.normal_count = self.primvar_count = 0
-        self.place_count = self.surface_count = 0
+        self.balls: list[NDArray[np.float32]] = []
+        self.place_count = self.surface_count = self.ball_count = 0
         self.shared: dict[Hashable, Any] = {}
         """What instances of one mesh have in common, by where its arrays are"""
 
@@ -281,10 +286,14 @@ class _Pile:
         known = known | self._add_primvars(of_places or {})
         self.primvar_rows.append([known.get(name, (-1, 0, 0, 0)) for name in self.slots])
         count = 1 if part.triangles is None else len(part.triangles)
-        place, places = -1, 1
+        place, places, ball = -1, 1, -1
         if part.transforms is not None:
             place, places = self._add_places(part.transforms), len(part.transforms)
-        row = first, count, place, places, part.sphere, thing, self.surface_count, sheet, first_normal
+        if part.balls is not None:
+            ball, places = self.ball_count, len(part.balls)
+            self.balls.append(part.balls)
+            self.ball_count += places
+        row = first, count, place, places, ball, part.sphere, thing, self.surface_count, sheet, first_normal
         self.rows.append(row)
         self.surface_count += places
 
@@ -367,10 +376,18 @@ def pack_geometry(
         if len(many):
             _add_instances(pile, many, thing, told[0])
         thing += len(many)
+    for balls in scene.balls:
+        _check_balls(balls, len(scene.materials))
+        seen = {mask(balls.material, balls.static, owner) for owner, _ in balls.paths.owners()}
+        if len(seen) > 1:
+            raise SceneError(f"{balls.paths[0]}: some rays see some of its spheres alone; settle the scene first")
+        if len(balls):
+            _add_balls(pile, balls, thing, seen.pop())
+        thing += len(balls)
     points = np.concatenate(pile.points) if pile.points else np.zeros((0, 3), np.float32)
     bvh = Bvh(points, pile.parts)
-    columns: list[Any] = list(zip(*pile.rows, strict=True)) or [()] * 9
-    first, count, place, places, sphere, thing_of, surface, sheet, first_normal = columns
+    columns: list[Any] = list(zip(*pile.rows, strict=True)) or [()] * 10
+    first, count, place, places, ball, sphere, thing_of, surface, sheet, first_normal = columns
     primvar_rows = np.array(pile.primvar_rows, np.int64).reshape(len(pile.rows), len(slots), 4)
     geometry = Geometry(
         handle=bvh.handle,
@@ -383,6 +400,8 @@ def pack_geometry(
         places=np.array(places, np.int64),
         transforms=_joined(pile.transforms) if pile.transforms else np.zeros((0, 3, 4), np.float32),
         sphere=np.array(sphere, np.float32).reshape(-1, 4),
+        ball=np.array(ball, np.int64),
+        balls=_joined(pile.balls) if pile.balls else np.zeros((0, 4), np.float32),
         thing=np.array(thing_of, np.int32),
         surface=np.array(surface, np.int32),
         sheet=np.array(sheet, np.uint8),
@@ -427,6 +446,12 @@ def places_of(geometry: Geometry, part: int) -> NDArray[np.float32]:
     """A part's places, shape (N, 3, 4): engine world from where its points are."""
     k = int(geometry.place[part])
     return geometry.transforms[k : k + int(geometry.places[part])] if k >= 0 else np.eye(3, 4, dtype=np.float32)[None]
+
+
+def balls_of(geometry: Geometry, part: int) -> NDArray[np.float32]:
+    """Centres and radii of a part that is many spheres, shape (N, 4) [m]."""
+    k = int(geometry.ball[part])
+    return geometry.balls[k : k + int(geometry.places[part])]
 
 
 def caster_sets(scene: Scene) -> list[frozenset[str]]:
@@ -504,6 +529,30 @@ def _add_sphere(pile: _Pile, ball: Sphere, thing: int, mask: int) -> None:
     centre = np.array(ball.centre)
     bounds = (centre - ball.radius, centre + ball.radius)
     pile.add(part, np.array([ball.material], np.int32), thing, False, None, ball.primvars, bounds)
+
+
+def _add_balls(pile: _Pile, balls: Balls, thing: int, mask: int) -> None:
+    table = np.concatenate([balls.centres, balls.radii[:, None]], axis=1).astype(np.float32)
+    wide = float(balls.radii.max())
+    bounds = (balls.centres.min(axis=0) - wide, balls.centres.max(axis=0) + wide)
+    same = {name: values for name, values in balls.primvars.items() if values.ndim == 3}
+    own = {name: values for name, values in balls.primvars.items() if values.ndim == 2}
+    part = Part(mask, None, (0.0, 0.0, 0.0, 0.0), balls=table)
+    pile.add(part, np.array([balls.material], np.int32), thing, False, None, same, bounds, own)
+
+
+def _check_balls(balls: Balls, material_count: int) -> None:
+    count, path = len(balls.radii), balls.paths[0] if len(balls.paths) else "spheres"
+    if balls.centres.shape != (count, 3) or balls.radii.shape != (count,) or len(balls.paths) != count:
+        raise SceneError(f"{path}: centres must have shape (N, 3), radii (N,), and paths be N")
+    if not 0 <= balls.material < material_count:
+        raise SceneError(f"{path}: material must be an index below {material_count}")
+    for name, values in balls.primvars.items():
+        if values.shape[:-1] not in ((count,), (1, 1)):
+            raise SceneError(f"{path}: primvar {name} must have shape ({count}, D) or (1, 1, D)")
+    bad = np.flatnonzero(~np.isfinite(balls.centres).all(axis=1) | ~np.isfinite(balls.radii) | (balls.radii <= 0.0))
+    if len(bad):
+        raise SceneError(f"{balls.paths[int(bad[0])]}: a sphere must be finite with a radius above 0")
 
 
 def _check_instances(many: Instances, material_count: int) -> None:

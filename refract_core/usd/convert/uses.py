@@ -144,6 +144,8 @@ def drawn(
         places: dict[Sdf.Path, list[F64]] = defaultdict(list)
         instanced = []
         for placement in walk(stage, time, PURPOSES, notices):
+            if placement.prim.GetTypeName() not in DRAWN:
+                continue
             if placement.prim.GetPath() not in places:
                 instanced.append(placement.prim)
             places[placement.prim.GetPath()].extend(placement.worlds)

@@ -14,13 +14,16 @@ import numpy as np
 from pxr import Sdf
 
 from ...errors import StageError
-from ...scene import F32, F64, Instances, Mesh, Notice, Paths
+from ...scene import F32, F64, Balls, Instances, Mesh, Notice, Paths
 from .parts import Part, Tables, stays_one
-from .place import BEYOND, FLAT, LARGEST, NOTHING_LEFT, of_instances
+from .place import BEYOND, FLAT, LARGEST, NOTHING_LEFT, ROUND, of_instances
 from .primvars import spread
+from .shapes import Shape
 from .traverse import Placement, some_of
 from .triangulate import Index
 
+_FEW_BALLS = 64
+"""Places from which on spheres are one record."""
 MOST_APART = 100_000
 """Places with a mesh of their own that instances may have: what is flattened has no inside to be shared."""
 _SOME = 1 << 16
@@ -43,11 +46,25 @@ class Group(NamedTuple):
     """name -> shape (N, D): what the instancer says of each"""
 
 
+class Cloud(NamedTuple):
+    """Exact spheres of one material, in metres and Y up, not yet moved to the scene's centre."""
+
+    material: int
+    static: bool
+    paths: Paths
+    centres: F64
+    """shape (N, 3)"""
+    radii: F64
+    """shape (N,)"""
+    primvars: dict[str, F32]
+    """name -> shape (N, D), or (1, 1, D)"""
+
+
 def shared(
     placements: list[Placement], parts: Mapping[Sdf.Path, Part | None], own: Collection[str], metres_from_stage: F64,
     tables: Tables,
-) -> tuple[list[Placement], list[Group]]:  # fmt: skip
-    """What is to have a mesh of its own for every place, one place each, and what is not.
+) -> tuple[list[Placement], list[Group], list[Cloud]]:  # fmt: skip
+    """What is to have a mesh, or be a sphere, of its own for every place, one place each; and what is not.
 
     Args:
         parts: by the paths of their prims
@@ -64,14 +81,20 @@ def shared(
         if part is None:
             continue
         many = len(placement.worlds) > 1 or placement.prim.IsInstanceProxy()
-        if many and not _is_ball(part) and str(placement.prim.GetPath()) not in own:
+        if many and str(placement.prim.GetPath()) not in own:
             together.setdefault(_likeness(part, placement, tables), []).append((number, placement))
         else:
             alone.append((number, placement))
-    groups = []
+    groups: list[Group] = []
+    clouds: list[Cloud] = []
     for found in together.values():
         part = parts[found[0][1].prim.GetPath()]
         assert part is not None
+        if _is_ball(part):
+            if sum(len(placement.worlds) for _, placement in found) < _FEW_BALLS:
+                alone.extend(found)
+                continue
+            found = _clouds(part, found, metres_from_stage, tables, clouds)
         count = sum(len(placement.worlds) for _, placement in found)
         if not stays_one(count, len(part.shape.triangles)):
             alone.extend(found)
@@ -83,10 +106,10 @@ def shared(
     apart = sum(len(placement.worlds) for _, placement in alone if placement.instance is not None)
     if apart > MOST_APART:
         path = next(placement.path for _, placement in alone if placement.instance is not None)
-        text = f"{apart} instances, from this one on, cannot share a mesh, as they are flat, or spheres"
+        text = f"{apart} instances, from this one on, cannot share a mesh"
         raise StageError(f"{path}: {text}; at most {MOST_APART} can be rendered. Deactivate some of them")
     every = (placement.at(np.array([row])) for _, placement in alone for row in range(len(placement.worlds)))
-    return list(every), groups
+    return list(every), groups, clouds
 
 
 def _is_ball(part: Part) -> bool:
@@ -115,7 +138,7 @@ def _group(
     lost: list[str] = []
     gone: list[str] = []
     for number, placement in found:
-        some = _in_metres(placement.worlds, metres_from_stage, part.shape.prim_from_shape, middle)
+        some = in_metres(placement.worlds, metres_from_stage, part.shape.prim_from_shape, middle)
         finite, sense = _judged(some, half)
         lost += [placement.run.path(row) for row in np.flatnonzero(~finite).tolist()]
         flat = np.flatnonzero(finite & (sense == 0))
@@ -141,7 +164,41 @@ def _group(
     return [Group(part, runs[0].static and not part.shape.varying, where_drawn, middle, where, primvars)], left
 
 
-def _in_metres(worlds: F64, metres_from_stage: F64, prim_from_shape: F64, middle: F64) -> F64:
+def _clouds(
+    part: Part, found: list[tuple[int, Placement]], metres_from_stage: F64, tables: Tables, clouds: list[Cloud]
+) -> list[tuple[int, Placement]]:
+    """Adds the places in which a sphere stays one; returns the others."""
+    left = []
+    for number, placement in found:
+        matrices = in_metres(placement.worlds, metres_from_stage, part.shape.prim_from_shape, np.zeros(3))
+        radii = even_scales(matrices)
+        kept = (radii > 0.0) & (radii + np.abs(matrices[:, :, 3]).max(axis=1) < LARGEST)
+        rows = np.flatnonzero(kept)
+        if len(rows):
+            some = placement if kept.all() else placement.at(rows)
+            primvars = part.primvars | of_instances(part, some, tables)
+            static = placement.static and not part.shape.varying
+            centres = np.ascontiguousarray(matrices[rows, :, 3])
+            clouds.append(Cloud(int(part.materials[0]), static, Paths((some.paths,)), centres, radii[rows], primvars))
+        if not kept.all():
+            left.append((number, placement.at(np.flatnonzero(~kept))))
+    return left
+
+
+def even_scales(matrices: F64) -> F64:
+    """Scales of transforms that only turn, mirror and scale evenly; 0 for others. Shape (N,)."""
+    found = np.zeros(len(matrices))
+    with np.errstate(all="ignore"):
+        for start in range(0, len(matrices), _SOME):
+            linear = matrices[start : start + _SOME, :, :3]
+            squared = linear.transpose(0, 2, 1) @ linear
+            scale = np.trace(squared, axis1=1, axis2=2) / 3.0
+            off = np.abs(squared - scale[:, None, None] * np.eye(3)).max(axis=(1, 2))
+            found[start : start + _SOME] = np.where(np.isfinite(scale) & (off <= ROUND * scale), np.sqrt(scale), 0.0)
+    return found
+
+
+def in_metres(worlds: F64, metres_from_stage: F64, prim_from_shape: F64, middle: F64) -> F64:
     """Shape (N, 3, 4): metres from a frame about the middle of a shape."""
     turned = prim_from_shape.copy()
     turned[:3, 3] += prim_from_shape[:3, :3] @ middle
@@ -209,13 +266,16 @@ class Bodies:
     """Meshes in frames of their own, each array made once, so that all records of a shape share it."""
 
     def __init__(self) -> None:
+        self._shapes: dict[int, Shape] = {}
+        """Which keeps their addresses their own"""
         self._points: dict[int, F32] = {}
         self._normals: dict[int, F32 | None] = {}
 
     def instances(self, group: Group, centre: F64) -> Instances:
         """A group in engine world."""
         shape = group.part.shape
-        if id(shape) not in self._points:
+        if id(shape) not in self._shapes:
+            self._shapes[id(shape)] = shape
             self._points[id(shape)] = (shape.points.astype(np.float64) - group.middle).astype(np.float32)
             self._normals[id(shape)] = None if shape.normals is None else spread(shape.normals)
         transforms = np.empty(group.matrices.shape, np.float32)
@@ -234,4 +294,19 @@ class Bodies:
             inside_out=shape.inside_out,
         )
         return Instances(mesh, transforms, group.paths, group.primvars)
+
+
+def bounds_of_cloud(cloud: Cloud) -> tuple[F64, F64]:
+    """Lowest and highest corner [m]."""
+    low: F64 = (cloud.centres - cloud.radii[:, None]).min(axis=0)
+    high: F64 = (cloud.centres + cloud.radii[:, None]).max(axis=0)
+    return low, high
+
+
+def to_balls(cloud: Cloud, centre: F64) -> Balls:
+    """Spheres in engine world."""
+    return Balls(
+        (cloud.centres - centre).astype(np.float32), cloud.radii.astype(np.float32), cloud.material, cloud.paths,
+        cloud.primvars, cloud.static,
+    )  # fmt: skip
 

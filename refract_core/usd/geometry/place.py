@@ -18,7 +18,7 @@ FLAT = 1.0e-12
 """Volume of a transformed cube, relative to its edges, under which the transform flattens."""
 BEYOND = "skipped: its transform is not finite or takes it beyond 1e15 m"
 NOTHING_LEFT = "skipped: its transform has a scale of 0"
-_ROUND = 1.0e-6
+ROUND = 1.0e-6
 """Relative deviation up to which a transform counts as rotation and uniform scale."""
 
 
@@ -73,7 +73,7 @@ def _sense(linear: F64) -> int:
     return 0 if abs(determinant) <= FLAT * edges else int(math.copysign(1.0, determinant))
 
 
-def uniform_scale(linear: F64, tolerance: float = _ROUND) -> float:
+def uniform_scale(linear: F64, tolerance: float = ROUND) -> float:
     """Scale of a (3, 3) matrix that only turns, mirrors and scales evenly, up to a relative `tolerance`; else 0."""
     squared = linear.T @ linear
     scale = float(np.trace(squared)) / 3.0

@@ -23,6 +23,8 @@ MAX_PRIMS = 4_000_000
 
 CURVES = ("BasisCurves", "HermiteCurves")
 DRAWN = frozenset({"Mesh", *ATTRIBUTES, *CURVES})
+POINTS = "Points"
+"""Drawn too, but have no triangles"""
 _INSTEAD = {
     "NurbsCurves": "convert it to BasisCurves of basis bspline, or to a Mesh",
     "TetMesh": "its surface as a Mesh is (UsdGeomTetMesh.ComputeSurfaceFaces)",
@@ -175,7 +177,7 @@ def _descend(
             continue
         if prim.IsA(UsdGeom.Gprim) and _wanted(state, here):
             kind = str(prim.GetTypeName())
-            if kind in DRAWN:
+            if kind in DRAWN or kind == POINTS:
                 yield Placement(prim, Run((label,), _ONE), np.array(here.world).T[None, :3], here.static)
             else:
                 state.unsupported.setdefault(kind, []).append(label)

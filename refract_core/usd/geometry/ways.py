@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...scene import Instances, Material, Mesh, Notice, Sphere
+from ...scene import Balls, Instances, Material, Mesh, Notice, Sphere
 from ...world.instances import some_placed
 from ...world.solid import mean_way
 
@@ -17,7 +17,7 @@ _LOOKED_AT = 64
 
 def with_ways(
     materials: Sequence[Material], meshes: Sequence[Mesh], spheres: Sequence[Sphere], instances: Sequence[Instances],
-    metres_per_unit: float, notices: list[Notice],
+    balls: Sequence[Balls], metres_per_unit: float, notices: list[Notice],
 ) -> list[Material]:  # fmt: skip
     """The materials, of which those that tint have their colour after the mean way through a body: of several the
     median."""
@@ -29,6 +29,9 @@ def with_ways(
         if (used := _only_one(many.mesh)) in ways:
             some = [mean_way(mesh.points.astype(np.float64), mesh.triangles) for mesh in some_placed(many, _LOOKED_AT)]
             ways[used].extend(np.repeat(some, -(-len(many) // len(some))).tolist())
+    for cloud in balls:
+        if cloud.material in ways:
+            ways[cloud.material].extend((4.0 / 3.0 * cloud.radii.astype(np.float64)).tolist())
     for ball in spheres:
         if ball.material in ways:
             ways[ball.material].append(4.0 / 3.0 * ball.radius)

@@ -11,7 +11,7 @@ from pxr import Usd
 from ...probes.digest import stale_bakes
 from ...scene import F64, Probe, Scene, Volume
 from ...version import __version__
-from ...world.instances import around, placed
+from ...world.instances import around, placed, sphere
 from ...world.solid import encloses
 from .findings import ERROR, INFO, WARNING, Finding, Rule
 from .glass import Glass
@@ -103,7 +103,11 @@ def _solids_at(scene: Scene, point: F64) -> Iterator[tuple[str, Callable[[F64], 
     for mesh in (*scene.meshes, *around_it):
         if mesh.closed and encloses(mesh.points, mesh.triangles, point):
             yield mesh.path, lambda at, m=mesh: encloses(m.points, m.triangles, at)  # type: ignore[misc]
-    for ball in scene.spheres:
+    around_too = [
+        sphere(balls, k) for balls in scene.balls
+        for k in np.flatnonzero(np.linalg.norm(balls.centres - point, axis=1) < balls.radii).tolist()
+    ]  # fmt: skip
+    for ball in (*scene.spheres, *around_too):
         if np.linalg.norm(point - ball.centre) < ball.radius:
             yield ball.path, lambda at, b=ball: bool(np.linalg.norm(at - b.centre) < b.radius)  # type: ignore[misc]
 

@@ -20,7 +20,7 @@ from ..geometry.place import uniform_scale
 from ..geometry.primvars import Corners, Topology, read_primvar, spread
 from ..geometry.shapes import Shape, read_shape
 from ..geometry.skel import posed
-from ..geometry.traverse import CURVES, Placement, walk
+from ..geometry.traverse import CURVES, DRAWN, Placement, walk
 from ..geometry.triangulate import turned_over, weld
 from ..materials.read import THICKNESS_PRIMVAR, has_api, read_material
 from ..opening import open_as
@@ -125,7 +125,8 @@ def find_candidates(stage: Usd.Stage) -> Found:
     drawn: dict[Sdf.Path, list[Placement]] = defaultdict(list)
     in_pose = posed(stage, time, notices)
     for placement in walk(in_pose, time, PURPOSES, notices):
-        drawn[placement.prim.GetPath()].append(placement)
+        if placement.prim.GetTypeName() in DRAWN:
+            drawn[placement.prim.GetPath()].append(placement)
     prims = [placements[0].prim for placements in drawn.values()]
     rows = _Rows(time, unit, notices)
     groups: dict[str, list[Candidate]] = defaultdict(list)
