@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -116,8 +114,8 @@ def measure(path: str, picture: str) -> None:
 
     def told(what: str, since: tuple[float, float]) -> None:
         passed, computed = (after - before for after, before in zip(now(), since, strict=True))
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        held = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE") / 2**20
+        status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+        held, peak = (int(status[name].split()[0]) / 1024 for name in ("VmRSS", "VmHWM"))
         print(f"{what} {passed:.2f} {computed:.2f} {held:.0f} {peak:.0f}", flush=True)
 
     since = now()

@@ -12,7 +12,7 @@ from scene_reading import stage_of as to_usd
 
 from refract_core.errors import StageError
 from refract_core.scene import Mesh, Scene
-from refract_core.usd.geometry import parts, traverse
+from refract_core.usd.geometry import traverse
 from refract_core.usd.stage import open_stage, scene_from_stage
 from refract_core.world.instances import flat
 
@@ -184,8 +184,8 @@ def many(count: int = 20, extra: str = "", scales: list[tuple[float, ...]] | Non
 
 def as_meshes(text: str, monkeypatch: pytest.MonkeyPatch, few: int) -> tuple[Scene, dict[str, Mesh]]:
     """What is read where so many places are one mesh, and every place of it as a mesh, by its path."""
-    monkeypatch.setattr(parts, "FEW", few)
-    monkeypatch.setattr(parts, "SMALL", 1)
+    monkeypatch.setattr(traverse, "FEW", few)
+    monkeypatch.setattr(traverse, "SMALL", 1)
     scene = read(text)
     return scene, {mesh.path: mesh for mesh in flat(scene, 10**6).meshes}
 

@@ -15,7 +15,7 @@ from .along import BASES, STRAIGHT, Along, Rule
 from .cages import integers
 from .primvars import Topology, Unusable, as_values
 from .refined import Fineness
-from .traverse import CURVES, Placement, some_of
+from .traverse import CURVES, FEW, Placement, some_of
 from .triangulate import Index
 from .tubes import Rings, Sides, directions, ribbons, tubes
 
@@ -104,7 +104,11 @@ def cuts_for(
     placements: Sequence[Placement], time: Usd.TimeCode, fineness: Fineness, notices: list[Notice]
 ) -> dict[Sdf.Path, Cut]:
     """How finely the curves of a stage are cut, by prim. What is small is as fine as it should be; the rest share."""
-    drawn = Counter(placement.prim.GetPath() for placement in placements if placement.prim.GetTypeName() in CURVES)
+    drawn: Counter[Sdf.Path] = Counter()
+    for placement in placements:
+        if placement.prim.GetTypeName() in CURVES:
+            places = len(placement.worlds)
+            drawn[placement.prim.GetPath()] += places if places < FEW else 1  # more share their triangles
     prims = {placement.prim.GetPath(): placement.prim for placement in placements}
     sizes = [_size(prims[path], time)._replace(times=times) for path, times in drawn.items()]
     cuts = _cuts(sizes, fineness)

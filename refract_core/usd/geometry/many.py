@@ -11,22 +11,23 @@ from collections.abc import Collection, Hashable, Mapping
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from pxr import Sdf
 
 from ...errors import StageError
 from ...scene import F32, F64, Balls, Instances, Mesh, Notice, Paths
-from .parts import Part, Tables, stays_one
+from .parts import Part, Tables
 from .place import BEYOND, FLAT, LARGEST, NOTHING_LEFT, ROUND, of_instances
 from .primvars import spread
 from .shapes import Shape
-from .traverse import Placement, some_of
+from .traverse import Placement, some_of, stays_one
 from .triangulate import Index
 
 _FEW_BALLS = 64
 """Places from which on spheres are one record."""
 MOST_APART = 100_000
 """Places with a mesh of their own that instances may have: what is flattened has no inside to be shared."""
-_SOME = 1 << 16
+_SOME = 1 << 13
 """Places that are looked at together."""
 _LOOKED_AT = 1024
 """Places whose bounds are measured together."""
@@ -130,29 +131,27 @@ def _likeness(part: Part, placement: Placement, tables: Tables) -> Hashable:
 def _group(
     part: Part, found: list[tuple[int, Placement]], metres_from_stage: F64, tables: Tables
 ) -> tuple[list[Group], list[tuple[int, Placement]]]:
-    """One record, and what of it has to stand alone. What is nowhere, or nothing, is left out with a notice."""
+    """One record, and what of it has to stand alone. What is nowhere, or nothing, is left out with a notice. A million
+    places are held once: where they were in the stage's world is written over."""
     points = part.shape.points
     low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     middle, half = (low + high) / 2, (high - low) / 2
+    frame = metres_from_stage, part.shape.prim_from_shape, middle
     runs, matrices, left = [], [], []
     lost: list[str] = []
     gone: list[str] = []
     for number, placement in found:
-        some = in_metres(placement.worlds, metres_from_stage, part.shape.prim_from_shape, middle)
-        finite, sense = _judged(some, half)
+        finite, sense = _judged(placement.worlds, frame, half)
         lost += [placement.run.path(row) for row in np.flatnonzero(~finite).tolist()]
         flat = np.flatnonzero(finite & (sense == 0))
-        sheets = _rank(some[flat]) > 1
+        sheets = _rank(in_metres(placement.worlds[flat], *frame)) > 1
         gone += [placement.run.path(row) for row in flat[~sheets].tolist()]
         if sheets.any():
             left.append((number, placement.at(flat[sheets])))
         kept = np.flatnonzero(finite & (sense != 0))
-        if len(kept) == len(finite):
-            runs.append(placement)
-            matrices.append(some)
-        elif len(kept):
-            runs.append(placement.at(kept))
-            matrices.append(some[kept])
+        if len(kept):
+            runs.append(placement if len(kept) == len(finite) else placement.at(kept))
+            matrices.append(in_metres(runs[-1].worlds, *frame, over=True))
     for paths, text in ((lost, BEYOND), (gone, NOTHING_LEFT)):
         if paths:
             tables.notices.append(Notice(paths[0], text if len(paths) == 1 else f"{text} ({some_of(paths)})"))
@@ -198,11 +197,13 @@ def even_scales(matrices: F64) -> F64:
     return found
 
 
-def in_metres(worlds: F64, metres_from_stage: F64, prim_from_shape: F64, middle: F64) -> F64:
-    """Shape (N, 3, 4): metres from a frame about the middle of a shape."""
+def in_metres(
+    worlds: F64, metres_from_stage: F64, prim_from_shape: F64, middle: F64, *, over: bool = False
+) -> F64:
+    """Shape (N, 3, 4): metres from a frame about the middle of a shape. `over`: write it over `worlds`."""
     turned = prim_from_shape.copy()
     turned[:3, 3] += prim_from_shape[:3, :3] @ middle
-    found = np.empty_like(worlds)
+    found = worlds if over else np.empty_like(worlds)
     with np.errstate(all="ignore"):
         for start in range(0, len(worlds), _SOME):
             some = metres_from_stage[:3, :3] @ worlds[start : start + _SOME] @ turned
@@ -211,13 +212,13 @@ def in_metres(worlds: F64, metres_from_stage: F64, prim_from_shape: F64, middle:
     return found
 
 
-def _judged(matrices: F64, half: F64) -> tuple[Index, Index]:
+def _judged(worlds: F64, frame: tuple[F64, F64, F64], half: F64) -> tuple[NDArray[np.bool_], NDArray[np.int8]]:
     """Whether a box about the frame's origin stays within `LARGEST`; 1, -1 where a transform mirrors, 0 where it
-    flattens. Each of shape (N,)."""
-    finite, sense = np.zeros(len(matrices), bool), np.zeros(len(matrices), np.int64)
+    flattens. Each of shape (N,). `frame`: as `in_metres` is told."""
+    finite, sense = np.zeros(len(worlds), bool), np.zeros(len(worlds), np.int8)
     with np.errstate(all="ignore"):
-        for start in range(0, len(matrices), _SOME):
-            some = matrices[start : start + _SOME]
+        for start in range(0, len(worlds), _SOME):
+            some = in_metres(worlds[start : start + _SOME], *frame)
             linear = some[:, :, :3]
             reach = np.abs(some[:, :, 3]) + np.abs(linear) @ half
             volume = (linear[:, 0] * np.cross(linear[:, 1], linear[:, 2])).sum(axis=1)

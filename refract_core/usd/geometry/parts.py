@@ -17,16 +17,11 @@ from .curves import Cut
 from .primvars import as_values, read_primvar, spread
 from .refined import Fineness
 from .shapes import Shape
-from .traverse import Placement, some_of
+from .traverse import Placement, some_of, stays_one
 
 MOST_IN_ALL = 4_000_000
 """Triangles that the subdivision surfaces of a stage have together, counted wherever they are drawn, but once where an
 instancer draws so many that they are one mesh (`many.shared`)."""
-FEW = 8
-"""Places from which on a prim may stay one mesh."""
-SMALL = 4096
-"""Triangles that all of its places have together, from which on it does: less is as fast and as small as meshes of
-their own, which everything else knows how to look at."""
 
 
 @dataclass
@@ -67,11 +62,6 @@ class Part(NamedTuple):
     """name -> (T, 3, D), or (1, 1, D) where constant"""
     wanted: frozenset[str]
     """Names its materials read, whether it has them or not."""
-
-
-def stays_one(places: int, triangles: int) -> bool:
-    """A prim that is drawn in many places is one mesh with many transforms."""
-    return places >= FEW and places * triangles >= SMALL
 
 
 def affordable(placements: Sequence[Placement], time: Usd.TimeCode, fineness: Fineness) -> Fineness:

@@ -10,14 +10,19 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom
 
 from ...errors import StageError
-from ...scene import F64, Notice, Run
+from ...scene import F64, I32, Notice, Run
 from .gprims import ATTRIBUTES
 from .triangulate import Index
 
 MAX_INSTANCES = 4_000_000
 """Prims that point instancers may stand for, in all."""
-_SOME = 1 << 16
+_SOME = 1 << 13
 """Instances whose transforms are multiplied together."""
+FEW = 8
+"""Places from which on a prim may stay one mesh."""
+SMALL = 4096
+"""Triangles that all of its places have together, from which on it does: less is as fast and as small as meshes of
+their own, which everything else knows how to look at."""
 MAX_PRIMS = 4_000_000
 """Prims looked at, native instances expanded."""
 
@@ -38,6 +43,11 @@ _PROTOTYPES = Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)
 _INSTANCER_ATTRIBUTES = ("protoIndices", "positions", "orientations", "orientationsf", "scales", "invisibleIds")
 
 
+def stays_one(places: int, triangles: int) -> bool:
+    """A prim that is drawn in many places is one mesh with many transforms."""
+    return places >= FEW and places * triangles >= SMALL
+
+
 class Placement(NamedTuple):
     """One prim at one place, or at all to which a point instancer takes it."""
 
@@ -48,7 +58,7 @@ class Placement(NamedTuple):
     """shape (N, 3, 4), in the stage's own world and units"""
     static: bool
     """Nothing that moves it varies in time, and `primvars:refract:static` is not 0."""
-    instance: tuple[Usd.Prim, Index] | None = None
+    instance: tuple[Usd.Prim, I32] | None = None
     """The innermost point instancer and, of shape (N,), the index in it."""
 
     @property
@@ -221,7 +231,7 @@ def _instances(state: _Walk, node: _Node, label: str) -> Iterator[Placement]:
     outer, state.within = state.within, (*state.within, path)
     world = np.array(node.world).T
     for place, target in enumerate(instancer.GetPrototypesRel().GetForwardedTargets()):
-        chosen = np.flatnonzero(prototypes == place)
+        chosen = np.flatnonzero(prototypes == place).astype(np.int32)
         parts = _prototype(state, node, target, static, drawn=len(chosen))
         for part in parts:
             yield _multiplied(part, prim, label, numbers[chosen], world, transforms, chosen)
@@ -229,7 +239,7 @@ def _instances(state: _Walk, node: _Node, label: str) -> Iterator[Placement]:
 
 
 def _multiplied(
-    part: Placement, instancer: Usd.Prim, label: str, numbers: Index, world: F64, transforms: F64, chosen: Index
+    part: Placement, instancer: Usd.Prim, label: str, numbers: I32, world: F64, transforms: F64, chosen: I32
 ) -> Placement:
     """What one instance draws of a prim, for all of them: `chosen` rows of `transforms`, which have `numbers`."""
     places, each = len(chosen), len(part.worlds)
@@ -241,7 +251,7 @@ def _multiplied(
         worlds[start : start + _SOME] = (some[:, None] @ square)[:, :, :3]
     first, *rest = part.run.pieces
     inner = np.broadcast_to(part.run.numbers, (places, *part.run.numbers.shape))
-    outer = np.broadcast_to(numbers.astype(np.int32)[:, None, None], (places, each, 1))
+    outer = np.broadcast_to(numbers[:, None, None], (places, each, 1))
     run = Run((f"{label}/[", f"]{first}", *rest), np.concatenate([outer, inner], axis=2).reshape(places * each, -1))
     instance = (instancer, numbers) if part.instance is None else (part.instance[0], np.tile(part.instance[1], places))
     return Placement(part.prim, run, worlds.reshape(-1, 3, 4), part.static, instance)
@@ -266,11 +276,11 @@ def _prototype(state: _Walk, node: _Node, target: Sdf.Path, static: bool, *, dra
     return parts
 
 
-def _placed_instances(state: _Walk, instancer: UsdGeom.PointInstancer) -> tuple[Index, Index, F64]:
+def _placed_instances(state: _Walk, instancer: UsdGeom.PointInstancer) -> tuple[I32, I32, F64]:
     """Number (N,), prototype (N,) and instancer_from_prototype (N, 4, 4) of every instance that is not masked out."""
     path = instancer.GetPath()
-    nothing = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 4, 4))
-    prototypes = np.asarray(instancer.GetProtoIndicesAttr().Get(state.time) or [], np.int64)
+    nothing = np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 4, 4))
+    prototypes = np.asarray(instancer.GetProtoIndicesAttr().Get(state.time) or [], np.int32)
     if not len(prototypes):
         state.notices.append(Notice(str(path), "the instancer has no protoIndices at this time; it draws nothing"))
         return nothing
@@ -279,7 +289,7 @@ def _placed_instances(state: _Walk, instancer: UsdGeom.PointInstancer) -> tuple[
             f"{path}: the instancer has {len(prototypes)} instances; at most {MAX_INSTANCES} can be rendered. "
             "Deactivate some of them"
         )
-    numbers = np.arange(len(prototypes))
+    numbers = np.arange(len(prototypes), dtype=np.int32)
     if mask := instancer.ComputeMaskAtTime(state.time):
         numbers = numbers[np.asarray(mask, bool)]
     rows = np.asarray(instancer.ComputeInstanceTransformsAtTime(state.time, state.time), np.float64)
