@@ -28,6 +28,7 @@ LAWS = "tests/test_render_laws.py"
 CORNERS = ("tests/test_corners.py",)
 CAUSTICS = ("tests/test_caustics.py", "tests/test_shading.py", ORACLE)
 GLOWS = ("tests/test_emission.py",)
+MANY = ("tests/test_instances.py", "tests/test_points.py")
 TREE = "tests/test_tree.py"
 SCREEN = (TREE, LAWS, "tests/test_screen.py", "tests/test_shading.py", "tests/test_nothing_invented.py")
 COPIED = (
@@ -163,7 +164,7 @@ MUTANTS = (
            "_add_gloss_of_sky(second, lane, world, row(second.f0, lane), second.roughness[lane], 0.0)"),
     Mutant("metal keeps its diffuse", "world/shading.py", "scale(base, 1.0 - metallic)", "scale(base, 1.0)"),
     Mutant("a normal map in mirrored uv is turned over", "world/surface.py",
-           "1.0 if area > 0.0 else -1.0", "1.0"),
+           "1.0 if hand > 0.0 else -1.0", "1.0"),
     Mutant("texture bias forgotten for scalars", "world/surface.py",
            "x = c[0] * materials.scale[m, i, channel] + materials.bias[m, i, channel]",
            "x = c[0] * materials.scale[m, i, channel]"),
@@ -262,7 +263,7 @@ MUTANTS = (
     Mutant("photons fall on the wrong side", "rendering/caustics.py",
            "((1.0, np.arange(len(parts))), (-1.0,", "((-1.0, np.arange(len(parts))), (-1.0,", CAUSTICS),
     Mutant("no light comes from within a body", "rendering/caustics.py",
-           "np.flatnonzero(np.isin(parts, within))", "np.flatnonzero(np.isin(parts, [-1]))", CAUSTICS),
+           "np.isin(world.geometry.surface[parts] + instances, within)", "np.zeros(len(parts), bool)", CAUSTICS),
     Mutant("a photon counts its texel's height", "world/caustics.py",
            "scale = abs(n[axis]) / (texel * texel)", "scale = 1.0 / (texel * texel)", CAUSTICS),
     Mutant("no layer but one's own", "world/caustics.py", "for k in range(-1, 2):", "for k in range(1):", CAUSTICS),
@@ -294,6 +295,23 @@ MUTANTS = (
            "if toward > 0.0:\n                axes", "if True:\n                axes", GLOWS),
     Mutant("points on what glows count alike", "world/lights.py",
            "return direction, distance, worth * max(0.0, dot(direction, n))", "return direction, distance, 1.0", GLOWS),
+    # --- many places
+    Mutant("all places of a mesh are one thing", "world/surface.py",
+           "return geometry.thing[hit.part] + hit.instance", "return geometry.thing[hit.part]", MANY),
+    Mutant("all places of a mesh are one surface", "world/surface.py",
+           "return geometry.surface[hit.part] + hit.instance", "return geometry.surface[hit.part]", MANY),
+    Mutant("a place that mirrors turns inside out", "world/surface.py",
+           "ng = scale(ng, sense_of(geometry, part, hit.instance))", "ng = scale(ng, 1.0)", MANY),
+    Mutant("normals of places go as points do", "world/surface.py",
+           "return (sense * dot(across, n), sense * dot(cross(z, x), n), sense * dot(cross(x, y), n))",
+           "return (dot(x, n), dot(y, n), dot(z, n))", MANY),
+    Mutant("all places have the first one's primvars", "world/tables.py",
+           "return first, 0, size, size", "return first, 0, 0, size", MANY),
+    Mutant("collections take instances all together", "world/instances.py",
+           "if len(numbers) <= 1:", "if len(numbers) <= 9:", MANY),
+    Mutant("droplets have the normals that their distance gives", "world/surface.py",
+           "ng = _exact_normal(centre, radius, ray, hit.t)", "ng = normalize(ng)", MANY),
+    # --- what glows, again
     Mutant("a sheet that glows has one side", "world/emitters.py", "if geometry.sheet[part] != 0:", "if False:", GLOWS),
     Mutant("nobody is within what glows", "world/emitters.py",
            "elif encloses(mesh.points, mesh.triangles, eye):", "elif False:", GLOWS),

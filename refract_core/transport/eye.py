@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..models import BY_TOKEN, Behind
-from ..scene import Camera, Material, Param, Scene
+from ..scene import Camera, Material, Mesh, Param, Scene
 from ..world.instances import around as around_places
 from ..world.instances import placed
 from ..world.solid import encloses
@@ -31,21 +32,18 @@ def view_ray(scene: Scene, camera: Camera, model: str) -> Rays:
     traced = np.array([_is_traced(material, model) for material in scene.materials], np.bool_)
     around: list[tuple[float, int, Material]] = []
     for thing, mesh in enumerate(scene.meshes):
-        of_glass = traced[mesh.materials]
-        if mesh.closed and of_glass.any() and encloses(mesh.points, mesh.triangles, eye):
-            filled_with = scene.materials[mesh.materials[of_glass.argmax()]]
-            around.append((float(np.prod(np.ptp(mesh.points, axis=0))), thing, filled_with))
+        filling = _filling(mesh, traced)
+        if filling >= 0 and encloses(mesh.points, mesh.triangles, eye):
+            around.append((float(np.prod(np.ptp(mesh.points, axis=0))), thing, scene.materials[filling]))
     for k, ball in enumerate(scene.spheres):
         if traced[ball.material] and math.dist(ball.centre, eye) < ball.radius:
             around.append(((2.0 * ball.radius) ** 3, len(scene.meshes) + k, scene.materials[ball.material]))
     first = len(scene.meshes) + len(scene.spheres)
     for many in scene.instances:
-        of_glass = traced[many.mesh.materials]
-        if many.mesh.closed and of_glass.any():
-            filled_with = scene.materials[many.mesh.materials[of_glass.argmax()]]
-            for k in around_places(many, eye):
-                size = float(np.prod(np.ptp(placed(many, k).points, axis=0)))
-                around.append((size, first + k, filled_with))
+        filling = _filling(many.mesh, traced)
+        for k in around_places(many, eye) if filling >= 0 else ():
+            size = float(np.prod(np.ptp(placed(many, k).points, axis=0)))
+            around.append((size, first + k, scene.materials[filling]))
         first += len(many)
     for balls in scene.balls:
         if traced[balls.material]:
@@ -59,6 +57,12 @@ def view_ray(scene: Scene, camera: Camera, model: str) -> Rays:
         ray.thing[:] = thing
         add_medium(ray.media, 0, thing, material.priority, ior, material.abbe, (r, g, b), material.absorption_distance)
     return ray
+
+
+def _filling(mesh: Mesh, traced: NDArray[np.bool_]) -> int:
+    """The material that fills a body; -1 where the mesh is none of traced glass."""
+    of_glass = traced[mesh.materials]
+    return int(mesh.materials[of_glass.argmax()]) if mesh.closed and of_glass.any() else -1
 
 
 def _is_traced(material: Material, model: str) -> bool:
