@@ -56,7 +56,20 @@ def _whole(folder: Path) -> Iterator[tuple[str, bytes]]:
             flat.Export(str(folder / f"{name}.{suffix}"))
             yield f"{name}.{suffix}", (folder / f"{name}.{suffix}").read_bytes()
         UsdUtils.CreateNewUsdzPackage(str(source), str(folder / f"{name}.usdz"))
-        yield f"{name}.usdz", (folder / f"{name}.usdz").read_bytes()
+        yield f"{name}.usdz", _timeless((folder / f"{name}.usdz").read_bytes())
+
+
+def _timeless(package: bytes) -> bytes:
+    """A package that does not say when it was made."""
+    data = bytearray(package)
+    with zipfile.ZipFile(io.BytesIO(package)) as archive:
+        at = archive.start_dir
+        for entry in archive.infolist():
+            data[entry.header_offset + 10 : entry.header_offset + 14] = bytes(4)
+            data[at + 12 : at + 16] = bytes(4)
+            lengths = (int.from_bytes(data[at + k : at + k + 2], "little") for k in (28, 30, 32))
+            at += 46 + sum(lengths)  # its name, extra fields and comment stand behind it
+    return bytes(data)
 
 
 # --- bombs -----------------------------------------------------------------------------------------------------------

@@ -173,7 +173,8 @@ def _said(heard: list[str], name: str) -> Iterator[Notice]:
     loose = {text: found[1] for text in warnings if (found := _LOOSE.search(text))}
     if loose:
         text = "bound to a material without MaterialBindingAPI, which USD may not follow one day; the binding is used"
-        yield Notice(next(iter(loose.values())), f"{text} ({some_of(list(dict.fromkeys(loose.values())))})")
+        prims = sorted(set(loose.values()))  # USD asks many at once, on threads
+        yield Notice(prims[0], f"{text} ({some_of(prims)})")
     for text in [text for text in warnings if text not in loose][:_WARNINGS]:
         yield Notice(name, f"USD says: {text}")
 
