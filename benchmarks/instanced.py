@@ -18,26 +18,11 @@ import time
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, Vt
 
+from .room import globe
+
 KINDS = ("leaf", "crystal")
-
-
-def globe(around: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Points and triangles of a unit globe with so many meridians, wound outward: 2 around (around / 2 - 1) of them."""
-    rings = around // 2
-    a, b = np.pi * np.arange(1, rings) / rings, 2 * np.pi * np.arange(around) / around
-    x, y, z = np.outer(np.sin(a), np.cos(b)), np.cos(a)[:, None], -np.outer(np.sin(a), np.sin(b))
-    grid = np.stack(np.broadcast_arrays(x, y, z), axis=2)
-    points = np.concatenate([[[0, 1, 0]], grid.reshape(-1, 3), [[0, -1, 0]]]).astype(np.float32)
-    i, j = np.arange(around), (np.arange(around) + 1) % around
-    last, first = len(points) - 1, 1 + (rings - 2) * around
-    faces = [np.stack([0 * i, 1 + i, 1 + j], 1), np.stack([first + i, 0 * i + last, first + j], 1)]
-    for ring in range(rings - 2):
-        p, q = 1 + ring * around + i, 1 + ring * around + j
-        faces += [np.stack([p, p + around, q + around], 1), np.stack([p, q + around, q], 1)]
-    return points, np.concatenate(faces).astype(np.int32)
 
 
 def make(path: Path, count: int, kind: str, around: int) -> int:
@@ -47,7 +32,7 @@ def make(path: Path, count: int, kind: str, around: int) -> int:
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     rng = np.random.default_rng(0)
     instancer = UsdGeom.PointInstancer.Define(stage, "/Many")
-    points, faces = globe(around)
+    points, faces = globe(around // 2, around)
     if kind == "leaf":
         side = count ** (1 / 3) * 1.5
         positions, scales = rng.uniform(-side / 2, side / 2, (count, 3)), rng.uniform(0.5, 1.2, (count, 3))
@@ -64,9 +49,9 @@ def make(path: Path, count: int, kind: str, around: int) -> int:
     instancer.CreateOrientationsAttr(Vt.QuathArray([Gf.Quath(*turn) for turn in turns.tolist()]))
     instancer.CreateProtoIndicesAttr(Vt.IntArray.FromNumpy(np.zeros(count, np.int32)))
     mesh = UsdGeom.Mesh.Define(stage, "/Many/One")
-    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points * np.float32(0.5)))
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy((0.5 * points).astype(np.float32)))
     mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
-    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(faces).reshape(-1)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.astype(np.int32).reshape(-1)))
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     instancer.CreatePrototypesRel().AddTarget(mesh.GetPath())
     if kind == "crystal":

@@ -2,7 +2,7 @@
 
     import refract_core as rc
 
-    frame = rc.render(rc.load_stage("scene.usda"), rc.RenderSettings(image_width=960))
+    frame = rc.render(rc.load_stage(rc.sample("marble")), rc.RenderSettings(image_width=960))
     frame.save("out.exr")
 
 Names are loaded when first used: importing the package alone loads neither USD nor the kernels.
@@ -24,14 +24,18 @@ if not (Path(__file__).parent / "schemas").is_dir():
 from .usd.registering import register_with_usd
 
 if TYPE_CHECKING:
-    from .errors import Cancelled, EmbreeError, ImageError, RefractError, SceneError, StageError, UsageError
+    from . import optics as optics
+    from .errors import Cancelled, EmbreeError, ImageError, RefractError, SceneError, StageError, TimeUp, UsageError
     from .images.frame import Frame
+    from .optics.arrays import refract_node
     from .rendering.picture import render
     from .rendering.session import Session
     from .scene import Notice, Scene
     from .settings import Opening, RenderSettings
     from .usd.stage import load_stage
     from .verbs.override import OverrideError, override
+    from .verbs.samples import sample
+    from .verbs.table import bake_probes, bake_thickness, compare, convert, inspect, validate
 
 __all__ = [
     "Cancelled",
@@ -47,11 +51,20 @@ __all__ = [
     "SceneError",
     "Session",
     "StageError",
+    "TimeUp",
     "UsageError",
     "__version__",
+    "bake_probes",
+    "bake_thickness",
+    "compare",
+    "convert",
+    "inspect",
     "load_stage",
     "override",
+    "refract_node",
     "render",
+    "sample",
+    "validate",
 ]
 
 _ROOMS = {
@@ -68,15 +81,26 @@ _ROOMS = {
     "SceneError": "errors",
     "Session": "rendering.session",
     "StageError": "errors",
+    "TimeUp": "errors",
     "UsageError": "errors",
+    "bake_probes": "verbs.table",
+    "bake_thickness": "verbs.table",
+    "compare": "verbs.table",
+    "convert": "verbs.table",
+    "inspect": "verbs.table",
     "load_stage": "usd.stage",
     "override": "verbs.override",
+    "refract_node": "optics.arrays",
     "render": "rendering.picture",
+    "sample": "verbs.samples",
+    "validate": "verbs.table",
 }
 
 
 def __getattr__(name: str) -> Any:
     """Load a public name (PEP 562)."""
+    if name == "optics":  # a wing, which is there without an import of its own
+        return importlib.import_module(f"{__name__}.optics")
     if name not in _ROOMS:
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
     found = getattr(importlib.import_module(f"{__name__}.{_ROOMS[name]}"), name)

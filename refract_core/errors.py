@@ -6,6 +6,7 @@ RefractError
 ├── SceneError        a record of arrays is malformed (wrong shape, NaN, ...)   exit code 1
 ├── ImageError        a texture cannot be read or a picture cannot be written  exit code 1
 ├── EmbreeError       Embree is missing or refused something                   exit code 1
+├── TimeUp            the time limit came before a whole picture was there     exit code 1
 └── Cancelled         the caller asked to stop                                 exit code 3
 
 A message says what is wrong, where (prim path, flag or field), the valid range and what to do.
@@ -39,6 +40,10 @@ class ImageError(RefractError):
 
 class EmbreeError(RefractError):
     """Embree is missing, too old, or refused a call."""
+
+
+class TimeUp(RefractError):
+    """The time limit has come before every pixel was drawn; nothing was written."""
 
 
 class Cancelled(RefractError):

@@ -10,20 +10,21 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from .errors import RefractError
+from .errors import RefractError, UsageError
 
 
 def check_place(path: str, error: type[RefractError]) -> None:
     """Refuse a place where no file can be written.
 
     Raises:
-        error: the folder does not exist or is read-only, or `path` is a folder.
+        UsageError: the folder does not exist, or `path` is one. Nobody makes folders for a name that was misspelt.
+        error: the folder cannot be written.
     """
     folder = os.path.dirname(path) or "."
     if os.path.isdir(path):
-        raise error(f"{path}: is a folder; name a file")
+        raise UsageError(f"{path}: is a folder; name a file")
     if not os.path.isdir(folder):
-        raise error(f"{path}: the folder {folder} does not exist; make it first")
+        raise UsageError(f"{path}: the folder {folder} does not exist; make it first")
     try:  # permission bits do not tell everything (read-only mounts, quotas, network folders), so try
         with tempfile.TemporaryFile(dir=folder):
             pass

@@ -10,10 +10,12 @@ from __future__ import annotations
 import math
 import re
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property
+from html import escape
+from itertools import accumulate
 from typing import NamedTuple, overload
 
 import numpy as np
@@ -124,6 +126,14 @@ class Material:
     priority: int = 0
     """Nested dielectrics: the higher one owns the overlap."""
 
+    def __repr__(self) -> str:
+        facts = [f"model={self.model.token}", *(f"{name}={text}" for name, text in _told_inputs(self))]
+        return f"<Material {self.name}: {', '.join(facts)}>"
+
+    def _repr_html_(self) -> str:
+        """For a notebook."""
+        return _table(self.name, {"model": self.model.token, **dict(_told_inputs(self))})
+
     @property
     def refractive(self) -> bool:
         return self.model is not Model.NONE
@@ -214,8 +224,7 @@ class Paths(Sequence[str]):
 
     @cached_property
     def _ends(self) -> list[int]:
-        sizes = (1 if isinstance(run, str) else len(run.numbers) for run in self.runs)
-        return np.cumsum(list(sizes)).tolist() if self.runs else []
+        return list(accumulate(1 if isinstance(run, str) else len(run.numbers) for run in self.runs))
 
     def __len__(self) -> int:
         return self._ends[-1] if self._ends else 0
@@ -399,6 +408,10 @@ class Environment:
     u grows towards -X: u = 0.5 - atan2(x, z) / 2 pi, v = acos(y) / pi in the dome's frame."""
     dome_from_world: F64 = field(default_factory=lambda: np.eye(3))
     """shape (3, 3), rotates an engine-world direction into the dome's frame."""
+    hidden: bool = False
+    """It lights things, and shows in what they mirror. Past everything, and through glass, is `backdrop` instead."""
+    backdrop: tuple[float, float, float] | None = None
+    """Radiance, where hidden; None: nothing, the picture is open there."""
 
 
 @dataclass(frozen=True)
@@ -420,6 +433,8 @@ class Camera:
     """[m]; 0 is a pinhole, which has everything in focus. For perspective."""
     focus_distance: float = 1.0
     """[m] along the camera axis: what is there is sharp however wide the lens is."""
+    framing: bool = False
+    """Made to frame everything: a picture of another aspect is framed anew (`view.orbit`)."""
 
 
 @dataclass(frozen=True)
@@ -549,3 +564,57 @@ class Scene:
     """Things like the meshes; a reader makes them where there are many of one"""
     balls: tuple[Balls, ...] = ()
     """Things like the spheres"""
+
+    def __repr__(self) -> str:
+        facts = ", ".join(f"{what} {count}" for what, count in _told_scene(self).items())
+        return f"<Scene {self.name.rpartition('/')[2] or 'without a name'} at {self.time_code:g}: {facts}>"
+
+    def _repr_html_(self) -> str:
+        """For a notebook."""
+        glass = [material.name for material in self.materials if material.refractive]
+        rows = {what: str(count) for what, count in _told_scene(self).items()}
+        named = {"glass": _few(glass), "camera": self.cameras[0].path if self.cameras else ""}
+        return _table(self.name, {**rows, **{what: text for what, text in named.items() if text}})
+
+
+# --- in words -------------------------------------------------------------------------------------------------------
+
+_FEW = 8
+
+
+def _few(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _FEW} more" if len(names) > _FEW else ""
+    return ", ".join(names[:_FEW]) + more
+
+
+def _told_scene(scene: Scene) -> dict[str, int]:
+    """What there is in a scene, and how many of it; nothing of what there is none of."""
+    every = (*scene.meshes, *(many.mesh for many in scene.instances))
+    counts = {
+        "meshes": len(scene.meshes), "spheres": len(scene.spheres) + sum(map(len, scene.balls)),
+        "instances": sum(map(len, scene.instances)), "triangles": sum(len(mesh.triangles) for mesh in every),
+        "materials": len(scene.materials), "of glass": sum(material.refractive for material in scene.materials),
+        "textures": len(scene.textures), "lights": len(scene.lights), "domes": int(scene.environment is not None),
+        "cameras": len(scene.cameras), "probes": len(scene.probes), "notices": len(scene.notices),
+    }  # fmt: skip
+    return {what: count for what, count in counts.items() if count}
+
+
+def _told_inputs(material: Material) -> Iterator[tuple[str, str]]:
+    """The inputs that say what a material looks like; those of glass where it is glass."""
+    chosen = [Param.DIFFUSE, Param.ROUGHNESS, Param.OPACITY]
+    if material.refractive:
+        chosen = [Param.IOR, Param.THICKNESS, Param.TRANSMITTANCE, Param.ROUGHNESS]
+    for param in chosen:
+        source = material.inputs[param]
+        color = param in (Param.DIFFUSE, Param.TRANSMITTANCE)
+        text = "(" + ", ".join(f"{v:.4g}" for v in source.value[:3]) + ")" if color else f"{source.value[0]:.4g}"
+        text = f"texture {source.texture}" if source.texture >= 0 else source.primvar or text
+        yield param.name.lower(), text
+    if material.refractive:
+        yield "absorption_distance", f"{material.absorption_distance:.4g}"
+
+
+def _table(title: str, rows: Mapping[str, str]) -> str:
+    cells = "".join(f"<tr><th>{escape(what)}</th><td>{escape(text)}</td></tr>" for what, text in rows.items())
+    return f"<table><caption>{escape(title)}</caption>{cells}</table>"

@@ -24,7 +24,7 @@ from refract_core.errors import UsageError
 from refract_core.verbs.executors import scheduler_of
 from refract_core.version import __version__
 
-from . import openapi, pages, routes, thumbnails
+from . import live, openapi, pages, routes, thumbnails
 from .edge import Edge
 from .holding import Hold
 from .hosts import door
@@ -111,14 +111,17 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         stage_root=root,
     )  # fmt: skip
 
+    viewers = live.Live(jobs)
     webhooks = Webhooks(settings.key, settings.limits.webhooks)
 
     @contextlib.asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         jobs.start()
+        viewers.start()
         try:
             yield
         finally:
+            await viewers.stop()
             await jobs.stop()
             await webhooks.stop()
             hold.release()
@@ -129,7 +132,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         title="refract", version=__version__, docs_url=None, redoc_url=None, lifespan=lifespan,
         description="Renders USD stages with glass in them.", redirect_slashes=False,
     )  # fmt: skip
-    app.state.webhooks = webhooks
+    app.state.webhooks, app.state.live = webhooks, viewers
     app.state.jobs, app.state.settings, app.state.metrics = jobs, settings, metrics
     entry = door(settings.host, settings.allow_hosts, settings.allow_origins)
     app.add_middleware(Edge, door=entry, tokens=tokens_of(settings.tokens), metrics=metrics, key=settings.key)
@@ -140,6 +143,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     _add_pages(app, settings, metrics)
     app.include_router(routes.router)
     app.include_router(thumbnails.router)
+    app.include_router(live.router)
     openapi.describe(app, tokens=bool(settings.tokens))
     app.mount("/static/swagger", _Static(packages=[("fastapi_swagger", "resources")]), name="viewer")
     app.mount("/static", _Static(directory=_STATIC), name="static")
@@ -203,7 +207,8 @@ def _add_handlers(app: FastAPI) -> None:
 
 def _methods_here(request: Request) -> list[str]:
     """Methods of a path. Starlette names those of the first route that fits, and a path may have several."""
-    ours = [*routes.router.routes, *thumbnails.router.routes]  # FastAPI shows a router as one, which has no methods
+    # FastAPI shows a router as one, which has no methods.
+    ours = [*routes.router.routes, *thumbnails.router.routes, *live.router.routes]
     known = [*request.app.routes, *ours]
     fitting = [route for route in known if route.matches(request.scope)[0] is not Match.NONE]
     return sorted({method for route in fitting for method in getattr(route, "methods", None) or ()}) or ["GET"]

@@ -18,6 +18,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.types import Message
 
+from .beside import href_of
 from .limits import Limits
 from .models import StageOnly
 from .problems import Problem
@@ -240,8 +241,8 @@ def invalid(where: str, detail: str) -> Problem:
 # --- stages of ours ---------------------------------------------------------------------------------------------------
 
 
-def stages(root: Path | None) -> list[dict[str, Any]]:
-    """Stages under the root, the shallow ones first."""
+def stages(root: Path | None, limits: Limits) -> list[dict[str, Any]]:
+    """Stages under the root, the shallow ones first, each with the address of its picture."""
     found = []
     for folder, folders, names in os.walk(root or os.devnull):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
@@ -249,7 +250,8 @@ def stages(root: Path | None) -> list[dict[str, Any]]:
             path = Path(folder, name)
             if path.suffix.lower() in SUFFIXES and path.is_file() and not name.startswith("."):
                 found.append({"path": path.relative_to(root or "/").as_posix(), "bytes": path.stat().st_size})
-    return sorted(found, key=lambda one: (str(one["path"]).count("/"), one["path"]))[:1000]
+    listed = sorted(found, key=lambda one: (str(one["path"]).count("/"), one["path"]))[:1000]
+    return [{**one, "picture": href_of(root, str(one["path"]), limits)} for one in listed]
 
 
 def own_stage(root: Path | None, name: str) -> str:

@@ -46,6 +46,13 @@ class RenderSettings(TypedDict, total=False):
     webhook: str
     """Address that is told when the job has ended; `signing.is_from` says whether the service did it."""
     camera: str
+    azimuth: float
+    elevation: float
+    distance: float
+    fit: float
+    fov: float
+    focal_length: float
+    look_at: str | list[float]
     image_width: int
     image_height: int
     quality: str
@@ -60,9 +67,12 @@ class RenderSettings(TypedDict, total=False):
     screen: str
     model: str
     max_layers: int
+    denoise: bool
     exposure: float
     camera_light: bool
     emission_light: bool
+    studio: str
+    background: str
     purposes: list[str]
     time_code: float
     widths: list[int]

@@ -13,9 +13,9 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from . import quota, reading
 from .bodies import own_stage
@@ -47,6 +47,17 @@ class _Picture(BaseModel):
     time_code: float
 
 
+class _View(BaseModel):
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+    camera: Annotated[str, Field(max_length=1024)]
+    azimuth: float
+    elevation: float
+    distance: float
+    look_at: Annotated[list[float], Field(min_length=3, max_length=3)]
+    width: float
+    orthographic: bool
+
+
 class _Done(BaseModel):
     """What a worker may say at its end. It has read a stranger's file, so it is not believed blindly."""
 
@@ -55,6 +66,7 @@ class _Done(BaseModel):
     height: int | None = None
     aovs: list[_Plane] = []
     pictures: list[_Picture] = []
+    view: _View | None = None
 
 
 class Jobs:
@@ -351,6 +363,10 @@ class Jobs:
 
     def _discreet(self, text: Any) -> str:
         return without_folders(str(text)[:10_000], self._hidden)
+
+    def problem_of(self, message: Any) -> Problem:
+        """A worker's own words, for strangers."""
+        return _problem_of(message, self._discreet)
 
     def _problem_of(self, record: Record, message: Any, work: Path) -> Problem:
         """A worker's own words, with what only the server can know about them."""

@@ -30,6 +30,7 @@ class Metrics:
         self.refused = Counter(
             "refract_connections_refused_total", "Connections closed for lack of places", ["why"], registry=registry
         )
+        self.live = Gauge("refract_live_viewers", "Live viewers that hold a stage", registry=registry)
         self.slots = Gauge("refract_slots", "Places for one job each", ["state"], registry=registry)
         self.slot_failures = Counter(
             "refract_slot_failures_total", "Slots that got no worker and were started again", registry=registry

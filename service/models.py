@@ -15,10 +15,13 @@ else:
 Tier = Literal["screen", "ray", "probe", "sky"]
 Purpose = Literal["default", "render", "proxy", "guide"]
 Aov = Literal[
-    "beauty", "refraction", "reflection", "transmittance", "N", "P", "Z", "mask", "thickness", "path_length", "layers",
-    "weight.screen", "weight.ray", "weight.probe", "weight.sky", "weight.none", "confidence",
+    "beauty", "refraction", "reflection", "transmittance", "albedo", "N", "P", "denoising_normal", "Z", "mask",
+    "thickness", "path_length", "layers", "weight.screen", "weight.ray", "weight.probe", "weight.sky",
+    "weight.none", "confidence",
 ]  # fmt: skip
 Path = Annotated[str, StringConstraints(min_length=1, max_length=1024, pattern=r"^[^\x00-\x1f\x7f]+$")]
+PrimPath = Annotated[str, StringConstraints(min_length=1, max_length=1024, pattern=r"^/[^\x00-\x1f\x7f]*$")]
+Point = Annotated[list[Annotated[float, Field(ge=-1e12, le=1e12)]], Field(min_length=3, max_length=3)]
 _Once = Field(json_schema_extra={"uniqueItems": True})
 Side = Annotated[int, Field(ge=1, le=1 << 28)]
 TimeCode = Annotated[float, Field(ge=-1e9, le=1e9)]
@@ -63,6 +66,23 @@ class Render(StageOnly):
     """`POST /v1/render`. What is left out is as the stage's own render settings say, else as on the command line."""
 
     camera: Annotated[str, StringConstraints(max_length=1024, pattern=r"^[^\x00-\x1f\x7f]*$")] | None = None
+    azimuth: Annotated[float, Field(ge=-1e6, le=1e6, description=(
+        "side from which a camera of its own looks [degrees]: 0 is the front, 90 the right"
+    ))] | None = None  # fmt: skip
+    elevation: Annotated[float, Field(ge=-90.0, le=90.0, description="how high it stands [degrees]")] | None = None
+    distance: Annotated[float, Field(ge=1e-9, le=1e12, description=(
+        "from what it looks at, in the stage's own units"
+    ))] | None = None  # fmt: skip
+    fit: Annotated[float, Field(ge=0.01, le=1000.0, description=(
+        "in place of distance: how much larger the frame is than what it frames"
+    ))] | None = None  # fmt: skip
+    fov: Annotated[float, Field(ge=0.1, le=175.0, description="angle of the picture's width [degrees]")] | None = None
+    focal_length: Annotated[float, Field(ge=0.1, le=1e4, description=(
+        "in place of fov: of a lens before a film 20.955 mm wide [mm]"
+    ))] | None = None  # fmt: skip
+    look_at: PrimPath | Point | None = Field(
+        None, description="in the middle of the picture: a point in the stage's own units, or the path of a prim"
+    )
     image_width: Annotated[int, Field(ge=1, le=1 << 28)] | None = None
     image_height: Annotated[int, Field(ge=0, le=1 << 28, description="0 follows the camera's aspect")] | None = None
     quality: Literal["draft", "good", "best", "reference"] | None = None
@@ -77,9 +97,16 @@ class Render(StageOnly):
     screen: Literal["march", "proxy", "traced"] | None = None
     model: Model | None = None
     max_layers: Annotated[int, Field(ge=1, le=32, description="surfaces of glass that a ray may enter")] | None = None
+    denoise: bool | None = Field(
+        None, description="take the noise out of the picture with Open Image Denoise; other planes stay"
+    )
     exposure: Annotated[float, Field(ge=-64.0, le=64.0)] | None = None
     camera_light: bool | None = None
     emission_light: bool | None = None
+    studio: Literal["softbox", "daylight", "dark", "none"] | None = None
+    background: (
+        Annotated[str, StringConstraints(max_length=11, pattern=r"^(transparent|environment|#[0-9a-fA-F]{6})$")] | None
+    ) = Field(None, description="what is seen past everything, and through glass")
     purposes: Annotated[list[Purpose], Field(min_length=1, max_length=4), _Once] | None = None
     time_code: TimeCode | None = None
     widths: Annotated[list[Side], Field(min_length=1, max_length=64), _Once] | None = Field(
@@ -92,9 +119,23 @@ class Render(StageOnly):
     format: Literal["png", "jpeg", "webp", "avif", "exr"] | None = Field(
         None, description="of the picture; left out, the header Accept chooses"
     )
-    aovs: Annotated[list[Aov], Field(max_length=17), _Once] | None = None
+    aovs: Annotated[list[Aov], Field(max_length=19), _Once] | None = None
     color_correction: Literal["disabled", "sRGB", "openColorIO"] | None = None
     overrides: Annotated[dict[Path, Override], Field(max_length=256)] | None = None
+
+
+class LiveStage(StageOnly):
+    """`POST /v1/live`."""
+
+    variants: Annotated[list[Variant], Field(max_length=64), _Once] | None = None
+
+
+class Viewer(BaseModel):
+    """What `POST /v1/live` answers."""
+
+    id: str
+    idle_seconds: int = Field(description="after which it ends where no picture is asked for [s]")
+    links: dict[str, str]
 
 
 class Convert(StageOnly):
@@ -124,6 +165,18 @@ class Picture(BaseModel):
     width: int
     height: int
     time_code: float
+
+
+class View(BaseModel):
+    """A camera, as fields of a render say it: where one that turns around what is seen starts from."""
+
+    camera: str = Field(description="its path; empty where the stage has none, and everything is framed")
+    azimuth: float = Field(description="[degrees]")
+    elevation: float = Field(description="[degrees]")
+    distance: float = Field(description="from what it looks at, in the stage's own units")
+    look_at: list[float] = Field(description="what is in the middle, in the stage's own units")
+    width: float = Field(description="of the picture, at distance 1; in metres where it is orthographic")
+    orthographic: bool
 
 
 class FieldProblem(BaseModel):
@@ -160,6 +213,7 @@ class Job(BaseModel):
     height: int | None
     aovs: list[AovPicture]
     pictures: list[Picture] = Field(description="where there are several")
+    view: View | None = Field(description="of one picture that is drawn: the stage's camera that it starts from")
     problem: ProblemDocument | None
     links: dict[str, str]
 
@@ -167,6 +221,7 @@ class Job(BaseModel):
 class StageFile(BaseModel):
     path: str = Field(description="what a request calls it")
     bytes: int
+    picture: str = Field(description="address of the picture that lies beside it; empty where none does")
 
 
 class Stages(BaseModel):

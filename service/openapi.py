@@ -43,7 +43,9 @@ _RESULT_HEADERS = {
 _TAGS = (
     ("work", ("/v1/render", "/v1/convert", "/v1/inspect", "/v1/validate"), "what is done with a stage"),
     ("jobs", ("/v1/jobs",), "how a job is doing, and what it made"),
-    ("thumbnails", ("/v1/thumbnails", "/v1/stages/"), "pictures with an address, and the stages sent for them"),
+    ("thumbnails", ("/v1/thumbnails", "/v1/pictures/", "/v1/stages/"),
+     "pictures with an address, and the stages sent for them"),
+    ("live", ("/v1/live",), "small pictures of a stage that is kept ready"),
     ("service", ("/",), "the service itself"),
 )
 """Tag, how the paths that have it begin (the first that fits counts), and what it means."""
@@ -128,6 +130,36 @@ def result(what: str, *media: str) -> dict[str, Any]:
     return {"openapi_extra": {"parameters": _CONDITIONS}, "responses": answers}
 
 
+def live_stage() -> dict[str, Any]:
+    """Keywords for the route that opens a live viewer."""
+    made = {"model": models.Viewer, "description": "the viewer", "headers": {
+        "Location": _header("address of the viewer"), "Cache-Control": _header("no-store"),
+    }}  # fmt: skip
+    return {"openapi_extra": {"requestBody": _body(models.LiveStage)},
+            "responses": {201: made, **problems(403, 408, 413, 415, 422, 429, 503, 507)}}  # fmt: skip
+
+
+def live_picture(left_out: Iterable[str]) -> dict[str, Any]:
+    """Keywords for the route of live pictures.
+
+    Args:
+        left_out: fields of a render that they do not have.
+    """
+    schema = _inlined(models.Render)
+    kept = {name: value for name, value in schema["properties"].items() if name not in left_out}
+    body = {**schema, "properties": kept, "required": ["image_width", "image_height"]}
+    content = {"application/json": {"schema": {key: value for key, value in body.items() if key != "description"}}}
+    done = {"description": "the picture", "content": {"image/png": {}},
+            "headers": {"Cache-Control": _header("no-store")}}  # fmt: skip
+    return {"openapi_extra": {"requestBody": {"required": True, "content": content}},
+            "responses": {200: done, **problems(403, 404, 408, 413, 415, 422, 429, 500, 503, 507)}}  # fmt: skip
+
+
+def live_end() -> dict[str, Any]:
+    """Keywords for the route that ends a live viewer."""
+    return {"responses": {204: {"description": "it has ended"}, **problems(403, 404)}}
+
+
 def stage_by_digest() -> dict[str, Any]:
     """Keywords for the route that keeps a stage."""
     body = {"required": True, "content": {
@@ -138,6 +170,16 @@ def stage_by_digest() -> dict[str, Any]:
     there = {"description": "it was there already"}
     refusals = problems(403, 404, 408, 413, 415, 422, 429, 503)
     return {"openapi_extra": {"requestBody": body}, "responses": {201: made, 204: there, **refusals}}
+
+
+def picture_beside() -> dict[str, Any]:
+    """Keywords for the route of pictures that lie beside stages."""
+    headers = {name: _RESULT_HEADERS[name] for name in ("ETag", "Cache-Control")}
+    found = result("the picture", "image/png")
+    answers = {code: {**answer, "headers": {name: value for name, value in answer["headers"].items()
+                                            if name in (*headers, "Content-Range")}}
+               for code, answer in found["responses"].items() if code < 400}  # fmt: skip
+    return {"openapi_extra": found["openapi_extra"], "responses": {**answers, **problems(404, 416, 422)}}
 
 
 def thumbnail(query: dict[str, tuple[str, dict[str, Any]]], media: Iterable[str]) -> dict[str, Any]:

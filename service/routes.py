@@ -15,6 +15,9 @@ from fastapi import APIRouter, Request, Response
 from starlette.responses import FileResponse, JSONResponse, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
+from refract_core.errors import UsageError
+from refract_core.images.denoise import check_installed
+
 from . import models, openapi
 from .bodies import invalid, own_stage, read_wish, stages
 from .digests import file_digest, tree_digest
@@ -182,6 +185,11 @@ def check_limits(settings: dict[str, Any], jobs: Jobs) -> None:
         if len(set(settings.get(name, ()))) != len(settings.get(name, ())):
             raise Problem("invalid-settings", f"{name} names something twice",
                           errors=[{"pointer": f"/{name}", "detail": "names something twice"}])  # fmt: skip
+    if settings.get("denoise"):
+        try:
+            check_installed()
+        except UsageError as error:
+            raise invalid("/denoise", str(error).removeprefix("--denoise ")) from None
     for one, others in (("widths", ("image_width", "image_height")), ("time_codes", ("time_code",))):
         for other in others:
             if one in settings and other in settings:
@@ -340,7 +348,8 @@ async def report(request: Request, identifier: str) -> Response:
 @router.get("/stages", response_model=models.Stages)
 async def own_stages(request: Request) -> dict[str, list[dict[str, Any]]]:
     """Stages that a request may name."""
-    return {"stages": await asyncio.to_thread(stages, jobs_of(request).stage_root)}
+    jobs = jobs_of(request)
+    return {"stages": await asyncio.to_thread(stages, jobs.stage_root, jobs.limits)}
 
 
 @router.get("/limits", response_model=models.LimitTable)

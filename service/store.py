@@ -91,7 +91,8 @@ class Record:
                 "problem")  # fmt: skip
         return {
             **{name: getattr(self, name) for name in kept}, "width": self.result.get("width"),
-            "height": self.result.get("height"), "aovs": aovs, "pictures": pictures, "links": links,
+            "height": self.result.get("height"), "aovs": aovs, "pictures": pictures,
+            "view": self.result.get("view"), "links": links,
         }  # fmt: skip
 
 

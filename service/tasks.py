@@ -20,12 +20,15 @@ from refract_core.errors import EmbreeError, ImageError, RefractError, SceneErro
 from refract_core.images.aovs import AOVS
 from refract_core.images.frame import Frame
 from refract_core.scene import Notice, Scene
+from refract_core.settings import NO_ORBIT, RenderSettings
 from refract_core.verbs.override import OverrideError, Overrides, override, override_notes
 
-from . import formats, reading, uploads
+from . import formats, reading, uploads, views
 from .discreet import own_folders, own_places, without_folders
 from .problems import Problem
 
+Verb = Callable[[str, str, Mapping[str, Any], Mapping[str, int], "Say"], Any]
+"""Does a job: stage, folder of results, settings, limits, and how to tell of it."""
 Say = Callable[..., None]
 """Tells the server something: `say(progress=0.5, stage="image")`, `say(path=..., warning=...)`."""
 
@@ -40,8 +43,9 @@ _CUT_OFF = "the package has no directory at its end, so it was cut off"
 _UNITS = ("Z", "thickness", "path_length", "layers")
 """Planes that are not between 0 and 1: their PNG is scaled, and says by how much."""
 _SETTINGS = ("camera", "image_width", "image_height", "quality", "preset", "samples", "tolerance", "light_samples",
-             "caustics", "indirect", "cut", "tiers", "screen", "model", "max_layers", "exposure", "camera_light",
-             "emission_light", "purposes")  # fmt: skip
+             "caustics", "indirect", "cut", "tiers", "screen", "model", "max_layers", "denoise", "exposure",
+             "camera_light", "emission_light", "studio", "background", "purposes", "azimuth", "elevation", "distance",
+             "fit", "fov", "focal_length", "look_at")  # fmt: skip
 
 
 def laid_out(stage: str, root: str, settings: Mapping[str, Any], limits: Mapping[str, int]) -> tuple[str, str]:
@@ -61,8 +65,14 @@ def laid_out(stage: str, root: str, settings: Mapping[str, Any], limits: Mapping
     return chosen, folder
 
 
-def perform(kind: str, stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[str, int], say: Say) -> Any:
+def perform(
+    kind: str, stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[str, int], say: Say,
+    verb: Verb | None = None,
+) -> Any:  # fmt: skip
     """Do one job. `stage` is relative to the current folder. Returns what the job's record keeps of it.
+
+    Args:
+        verb: in place of the one that `kind` names.
 
     Raises:
         Problem: for the client.
@@ -73,17 +83,20 @@ def perform(kind: str, stage: str, out: str, settings: Mapping[str, Any], limits
     try:
         if kind != "convert" and stage.lower().endswith(uploads.GLTF):
             stage = _as_usd(stage, say, limits)
-        return _VERBS[kind](stage, out, settings, limits, say)
+        return (verb or _VERBS[kind])(stage, out, settings, limits, say)
     except StageError as error:
         raise Problem("stage-invalid", _public(str(error))) from None
     except UsageError as error:
         if str(error).startswith("camera ") and settings.get("camera"):
             raise Problem("invalid-settings", _public(str(error)),
                           errors=[{"pointer": "/camera", "detail": "the stage has no such camera"}]) from None
+        if (field := str(error).partition(" ")[0]) in NO_ORBIT:
+            raise Problem("invalid-settings", _public(str(error)),
+                          errors=[{"pointer": f"/{field}", "detail": _public(str(error))}]) from None
         if str(error).startswith("variant "):
             raise Problem("invalid-settings", _public(str(error)),
                           errors=[{"pointer": "/variants", "detail": "the stage has no such variant"}]) from None
-        if "needs the extra" in str(error):
+        if "needs the extra `gltf`" in str(error):
             text = "glTF is not read here: the extra `gltf` is not installed"
             raise Problem("unsupported-media-type", text) from None
         raise Problem("invalid-settings", _public(str(error))) from None
@@ -161,12 +174,12 @@ def _tell(notices: tuple[Notice, ...] | list[Notice], say: Say, limits: Mapping[
 
 def _render(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[str, int], say: Say) -> Any:
     from refract_core.rendering.picture import render
-    from refract_core.rendering.ready import choose_camera
+    from refract_core.rendering.ready import camera_of
     from refract_core.rendering.session import Session
     from refract_core.usd.opening import select_variants
     from refract_core.usd.settings import read_settings
     from refract_core.usd.stage import open_stage, scene_from_stage
-    from refract_core.verbs.render_files import chosen_settings
+    from refract_core.verbs.render_files import chosen_settings, with_features
     from refract_core.view.camera import image_size
 
     say(progress=0.0, stage="reading the stage")
@@ -174,9 +187,8 @@ def _render(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[s
     select_variants(opened, settings.get("variants") or ())
     told: list[Notice] = []
     authored = read_settings(opened, "", told)
-    asked = {name: settings[name] for name in _SETTINGS if settings.get(name) is not None}
-    said = {name: tuple(value) if isinstance(value, list) else value for name, value in asked.items()}
-    wanted = chosen_settings(authored, {**said, "jobs": settings["threads"]})
+    wanted = chosen_settings(authored, {**asked_of(settings), "jobs": settings["threads"]})
+    wanted = with_features(wanted, settings.get("aovs") or ())
     overrides = settings.get("overrides") or {}
     sizes = [(width, 0) for width in settings.get("widths") or ()] or [(wanted.image_width, wanted.image_height)]
     times = settings.get("time_codes") or [settings.get("time_code")]
@@ -184,27 +196,37 @@ def _render(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[s
     session = Session() if count > 1 else None
     done: list[dict[str, Any]] = []
     for time_code in times:
-        scene = scene_from_stage(opened, time_code=time_code, purposes=wanted.purposes, camera=wanted.camera)
+        chosen: dict[str, Any] = {"purposes": wanted.purposes, "camera": wanted.camera, "orbits": wanted.orbits}
+        scene = scene_from_stage(opened, time_code=time_code, **chosen)
         reading.has_ended()
-        _check_scene(scene, limits)
-        camera = choose_camera(scene, wanted.camera)
-        measured = [image_size(camera, *size) for size in sizes]
+        check_scene(scene, limits)
+        measured = [image_size(camera_of(scene, _sized(wanted, size)), *size) for size in sizes]
         _check_sizes(measured, len(times), wanted.samples, settings["format"], limits)
-        scene = _override(scene, overrides)
+        scene = overridden(scene, overrides)
         told += scene.notices
-        for width, height in measured:
-            this = replace(wanted, image_width=width, image_height=height)
-            frame = render(scene, this, session=session, progress=_share_of(say, len(done), count))
+        for size in sizes:
+            frame = render(scene, _sized(wanted, size), session=session, progress=_share_of(say, len(done), count))
             told += frame.notices
             frame = replace(frame, metadata={**frame.metadata, **override_notes(overrides)})
             _save_picture(frame, out, settings, f"picture.{len(done)}" if count > 1 else "image")
             done.append({"width": frame.width, "height": frame.height, "time_code": float(scene.time_code)})
+    view = views.start_of(scene, wanted.camera)
     _tell(told, say, limits)
-    size = {"width": done[0]["width"], "height": done[0]["height"]}
+    whole = {"width": done[0]["width"], "height": done[0]["height"]}
     if count > 1:
         _pack_pictures(out, settings["format"], done)
-        return {**size, "pictures": done}
-    return {**size, "aovs": _save_planes(frame, out, settings)}
+        return {**whole, "pictures": done}
+    return {**whole, "view": view, "aovs": _save_planes(frame, out, settings)}
+
+
+def _sized(settings: RenderSettings, size: tuple[int, int]) -> RenderSettings:
+    return replace(settings, image_width=size[0], image_height=size[1])
+
+
+def asked_of(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """What settings ask of `RenderSettings`."""
+    asked = {name: settings[name] for name in _SETTINGS if settings.get(name) is not None}
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in asked.items()}
 
 
 def _share_of(say: Say, before: int, count: int) -> Callable[[float, str], None]:
@@ -250,7 +272,7 @@ def _pack_pictures(out: str, extension: str, done: list[dict[str, Any]]) -> None
         uploads.pack(named, os.path.join(out, "pictures.zip"))
 
 
-def _check_scene(scene: Scene, limits: Mapping[str, int]) -> None:
+def check_scene(scene: Scene, limits: Mapping[str, int]) -> None:
     triangles = sum(len(mesh.triangles) for mesh in scene.meshes)
     triangles += sum(len(many) * len(many.mesh.triangles) for many in scene.instances)
     triangles += sum(len(balls) for balls in scene.balls)
@@ -283,7 +305,7 @@ def _check_sizes(
         raise Problem("limit-exceeded", text)
 
 
-def _override(scene: Scene, overrides: Overrides) -> Scene:
+def overridden(scene: Scene, overrides: Overrides) -> Scene:
     try:
         return override(scene, overrides)
     except OverrideError as error:

@@ -15,8 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
+from starlette.responses import FileResponse
 
 from . import models, openapi
+from .beside import picture_of
 from .bodies import check, invalid, limited, own_stage, suffix_of
 from .digests import identifier_of, tree_digest
 from .formats import FORMATS, MEDIA, format_of
@@ -175,3 +177,25 @@ def _keeping(request: Request, lasting: bool) -> str:
     if until is None:
         return f"private, max-age={seconds}"
     return f"public, max-age={max(0, min(seconds, until - int(time.time())))}"
+
+
+# --- pictures that lie beside stages ----------------------------------------------------------------------------------
+
+
+@router.get("/pictures/{stage:path}", response_class=Response, **openapi.picture_beside())
+async def picture(request: Request, stage: str) -> Response:
+    """The picture that lies beside a stage of the stage root, as `picture` of GET /v1/stages says. It may be cached."""
+    jobs = jobs_of(request)
+    name = own_stage(jobs.stage_root, stage)
+    assert jobs.stage_root is not None
+    path = picture_of(jobs.stage_root, name, jobs.limits)
+    if path is None:
+        raise Problem("not-found", "no picture lies beside this stage; GET /v1/thumbnails draws one")
+    found = path.stat()
+    tag = f'"{found.st_mtime_ns:x}-{found.st_size:x}"'
+    public = "private" if request.app.state.settings.tokens else "public"
+    headers = {"ETag": tag, "Cache-Control": f"{public}, max-age={_FRESH}"}
+    asked = [one.strip().removeprefix("W/") for one in request.headers.get("if-none-match", "").split(",")]
+    if tag in asked or "*" in asked:
+        return Response(status_code=304, headers=headers)
+    return FileResponse(path, headers=headers, media_type="image/png", stat_result=found)

@@ -22,7 +22,7 @@ import traceback
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from . import confine
 from .quota import OFTEN, WORDS, Quota
@@ -127,7 +127,7 @@ def _warm() -> int:
     import refract_core.verbs.inspect  # noqa: F401
     from refract_core.usd.layers import mtlx
 
-    from . import precheck, tasks, warm  # noqa: F401  the first is needed once USD is open
+    from . import live_worker, precheck, tasks, warm  # noqa: F401  the first is needed once USD is open
 
     mtlx.make_ready()
     warm.draw()
@@ -216,8 +216,8 @@ def _serve(descriptor: int, knocker: int) -> int:
         from . import warm
 
         warm.draw(("traced",))
-    with os.fdopen(descriptor, "rb", closefd=False) as file:
-        line = file.readline()
+    orders = os.fdopen(descriptor, "rb", closefd=False)
+    line = orders.readline()
     if not line:
         return 0
     job = json.loads(line)
@@ -233,7 +233,7 @@ def _serve(descriptor: int, knocker: int) -> int:
     from .shortage import problem_of_job
 
     try:
-        say(done=_perform(job, say))
+        say(done=_perform(job, say, orders))
     except Problem as told:
         problem = problem_of_job(told) or told  # a full disk is no fault of the stage
         say(problem={"slug": problem.slug, "detail": problem.detail, "errors": problem.errors, "prim": problem.prim})
@@ -259,9 +259,13 @@ def _knock(knocker: int, job: dict[str, Any]) -> None:
     os.close(knocker)
 
 
-def _perform(job: dict[str, Any], say: Any) -> Any:
-    """Lock this process in, check what the stage names, do the job."""
-    from . import precheck, reading, tasks
+def _perform(job: dict[str, Any], say: Any, orders: BinaryIO) -> Any:
+    """Lock this process in, check what the stage names, do the job.
+
+    Args:
+        orders: what a live worker is asked for, after its job.
+    """
+    from . import live_worker, precheck, reading, tasks
     from .problems import Problem
 
     limits, root, folder = job["limits"], os.path.realpath(job["root"]), os.path.realpath(job["folder"])
@@ -288,7 +292,8 @@ def _perform(job: dict[str, Any], say: Any) -> Any:
         raise Problem("limit-exceeded", str(error)) from None
     except precheck.Refused as error:
         raise Problem("stage-refused", str(error)) from None
-    done = tasks.perform(job["kind"], stage, out, job["settings"], limits, say)
+    verb = live_worker.verb(orders) if job["kind"] == "live" else None
+    done = tasks.perform(job["kind"], stage, out, job["settings"], limits, say, verb)
     del held  # until here, for USD to find its layers read
     return done
 
@@ -296,12 +301,15 @@ def _perform(job: dict[str, Any], say: Any) -> Any:
 def own_files() -> list[str]:
     """What the program itself is made of, and nothing else of the machine."""
     import refract_core
+    from refract_core.images import denoise
     from refract_core.kernels.compile import cache_root
     from refract_core.usd.registering import FOLDER
 
     own = [str(Path(refract_core.__file__).parent), str(FOLDER), str(Path(__file__).parent)]
     system = ["/usr/lib", "/lib", "/lib64", "/etc/ld.so.cache", "/dev/null", "/dev/urandom", "/proc/cpuinfo",
               "/proc/meminfo", "/sys/devices/system/cpu"]  # fmt: skip
+    if folder := denoise.folder():
+        own.append(folder)  # it loads what it is made of when it is first needed
     return [*own, str(cache_root()), *{sys.prefix, sys.base_prefix}, *system]
 
 

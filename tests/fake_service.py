@@ -25,6 +25,15 @@ STATIC = Path(__file__).parents[1] / "service" / "static"
 TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 ENDED = ("done", "failed", "cancelled")
 WIDTH, HEIGHT = 64, 36
+STAGES = [
+    {"path": "ball.usda", "bytes": 9, "picture": "/v1/pictures/ball.usda"},
+    {"path": "room.usda", "bytes": 9, "picture": ""},
+    {"path": "parts/wall.usda", "bytes": 9, "picture": ""},
+]
+VIEW = {"camera": "/World/Near", "azimuth": 10.0, "elevation": 20.0, "distance": 4.0, "look_at": [0.0, 1.0, 0.0],
+        "width": 0.5, "orthographic": False}  # fmt: skip
+TOOK = 1.9
+"""[s] What every job says it took, whatever it did."""
 
 
 def png(pixel: Any) -> bytes:
@@ -41,7 +50,9 @@ def png(pixel: Any) -> bytes:
 def glass(name: str, model: str) -> dict[str, Any]:
     return {
         "path": f"/World/{name}", "material": f"/World/Looks/{name}", "by": "RefractMaterialAPI", "model": model,
-        "ior": {"value": 1.5, "by": "constant"}, "thickness": {"how": "typed", "least": 0.5, "most": 0.5},
+        "ior": {"value": 1.5, "by": "constant"}, "roughness": {"value": 0.25, "by": "constant"},
+        "transmittance_color": {"value": [0.5, 0.25, 1.0], "by": "constant"}, "absorption_distance": 0.75,
+        "thickness": {"how": "typed", "least": 0.5, "most": 0.5},
         "closed": True, "convex": True, "size": [0.5, 0.5, 0.5], "layers": 1, "tiers": ["screen", "probe", "sky"],
         "probes": [],
     }  # fmt: skip
@@ -83,8 +94,11 @@ class Job:
         aovs = [{"name": name, "href": "", "white": whites.get(name, 1.0)} for name in self.settings["aovs"]]
         return {
             "id": self.id, "kind": "render", "status": status, "fraction": fraction, "stage_of_work": "tiles",
-            "created": "", "started": None, "finished": None, "warnings": warnings, "width": WIDTH, "height": HEIGHT,
-            "aovs": aovs, "pictures": [], "problem": problem if status == "failed" else None, "links": {},
+            "created": "", "started": "2026-01-01T00:00:00.000+00:00",
+            "finished": f"2026-01-01T00:00:0{TOOK:.3f}+00:00" if status in ENDED else None, "warnings": warnings,
+            "width": WIDTH, "height": HEIGHT,
+            "aovs": aovs, "pictures": [], "view": VIEW if status == "done" else None,
+            "problem": problem if status == "failed" else None, "links": {},
         }  # fmt: skip
 
     def picture(self, name: str) -> bytes:
@@ -105,6 +119,8 @@ class FakeService(ThreadingHTTPServer):
     def __init__(self, seconds: float = 0.2, token: str = "") -> None:
         super().__init__(("127.0.0.1", 0), Handler)
         self.seconds, self.token = seconds, token
+        self.viewer = "a"
+        """The live viewer that there is a place for; '' is none."""
         self.jobs: dict[str, Job] = {}
         self.log: list[tuple[str, str, Any]] = []
         self.thread = threading.Thread(target=self.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
@@ -150,11 +166,29 @@ class Handler(BaseHTTPRequestHandler):
         if self.refused():
             return None
         if path == "/v1/stages":
-            return self.document(200, {"stages": [{"path": name, "bytes": 9} for name in ("ball.usda", "room.usda")]})
+            return self.document(200, {"stages": STAGES})
+        if path.startswith(("/v1/pictures/", "/v1/thumbnails/")):
+            colour = {"/v1/pictures/ball.usda": (200, 80, 40), "/v1/thumbnails/room.usda": (40, 80, 200)}.get(path)
+            if colour is None:
+                return self.problem(404, "not-found", "There is nothing here", "")
+            return self.reply(200, png(lambda x, y: colour), "image/png")
         return self.job(*path.removeprefix("/v1/jobs/").split("/"))
+
+    def live(self, settings: dict[str, Any]) -> None:
+        """A new viewer, or a picture of the one there is."""
+        viewer = self.server.viewer
+        if not viewer:
+            return self.problem(429, "queue-full", "Too many jobs are waiting", "all 2 live viewers are taken")
+        if self.path == "/v1/live":
+            return self.document(201, {"id": viewer})
+        if self.path != f"/v1/live/{viewer}/pictures":
+            return self.problem(404, "not-found", "There is nothing here", "there is no such viewer")
+        return self.reply(200, Job("", settings, 0.0).picture("beauty"), "image/png")
 
     def do_DELETE(self) -> None:
         self.server.log.append(("DELETE", self.path, None))
+        if self.path.startswith("/v1/live/"):
+            return self.reply(204, b"", "")
         job = self.server.jobs[self.path.rpartition("/")[2]]
         job.cancelled = True
         self.document(200, job.document())
@@ -171,6 +205,11 @@ class Handler(BaseHTTPRequestHandler):
         if settings.get("samples", 0) > 1000:
             where = [{"pointer": "/samples", "detail": "must be at most 1000"}]
             return self.problem(422, "invalid-settings", "The settings are not valid", "One field is wrong.", where)
+        if self.path.startswith("/v1/live"):
+            return self.live(settings)
+        if self.path == "/v1/render" and "Prefer" not in self.headers:
+            time.sleep(self.server.seconds)
+            return self.reply(200, Job("", settings, 0.0).picture("beauty"), "image/png")
         name = hashlib.sha256(json.dumps([stage, settings], sort_keys=True).encode()).hexdigest()
         known = self.server.jobs.get(name)
         if known is None or known.cancelled:
@@ -182,7 +221,7 @@ class Handler(BaseHTTPRequestHandler):
         kind = self.headers["Content-Type"]
         if kind == "application/json":
             settings = json.loads(raw)
-            return settings.pop("stage"), settings
+            return settings.pop("stage", ""), settings
         head = f"Content-Type: {kind}\r\n\r\n".encode()
         message = email.parser.BytesParser(policy=email.policy.HTTP).parsebytes(head + raw)
         parts = {part.get_param("name", header="content-disposition"): part for part in message.iter_parts()}

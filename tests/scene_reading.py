@@ -16,6 +16,21 @@ schemas.register()
 
 F64 = NDArray[np.float64]
 
+WALL_SEEN = """def Mesh "Wall" {
+    uniform token subdivisionScheme = "none"
+    int[] faceVertexCounts = [4, 4, 4, 4]
+    int[] faceVertexIndices = [0, 1, 4, 3, 1, 2, 5, 4, 3, 4, 7, 6, 4, 5, 8, 7]
+    point3f[] points = [(-4, -4, -3), (0, -4, -3), (4, -4, -3), (-4, 0, -3), (0, 0, -3), (4, 0, -3), (-4, 4, -3),
+        (0, 4, -3), (4, 4, -3)]
+    color3f[] primvars:displayColor = [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0)] (interpolation = "uniform") }
+def Camera "Cam" {
+    double3 xformOp:translate = (0.3, 0.2, 8)
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+    float2 clippingRange = (0.1, 100)
+    float focalLength = 60 }
+"""
+"""Four colours behind the origin, and a camera that sees what stands there bend them."""
+
 
 def stage_of(text: str, *, unit: float | None = 1.0, up: str = "Y", head: str = "") -> Usd.Stage:
     """A stage in memory; braces may stand on the line of a statement, which USD's text format does not allow."""

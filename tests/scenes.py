@@ -210,9 +210,10 @@ def scene(
 
 
 def draw(what: rc.Scene, width: int = 64, height: int = 64, **settings: Any) -> dict[str, F32]:
-    """Planes of a one-sample picture on one thread, without caustics, where what glows lights nothing, unless told
-    otherwise."""
-    chosen = {"samples": 1, "jobs": 1, "tiers": ("ray", "sky"), "caustics": 0, "emission_light": False, **settings}
+    """Planes of a one-sample picture on one thread, without caustics and any studio, where what glows lights nothing,
+    unless told otherwise."""
+    chosen = {"samples": 1, "jobs": 1, "tiers": ("ray", "sky"), "caustics": 0, "emission_light": False,
+              "studio": "none", **settings}  # fmt: skip
     return rc.render(what, rc.RenderSettings(image_width=width, image_height=height, **chosen)).planes
 
 

@@ -289,6 +289,26 @@ def test_a_kernel_without_annotations_is_refused() -> None:
         signature_of(two)
 
 
+# --- outside a checkout
+
+
+def test_a_wheel_brings_its_samples_and_can_draw_them(site: Path, tmp_path: Path) -> None:
+    """The first two commands of the README, in an empty folder, without a checkout."""
+    program = f"""
+import os, sys
+import refract_core as rc
+os.chdir({str(tmp_path)!r})
+assert rc.sample("marble").startswith({str(site)!r})
+from refract_core.cli import app
+app(["samples", "marble", "--to", "."], standalone_mode=False)
+app(["render", "marble.usda", "marble.png", "-w", "32", "--samples", "1"], standalone_mode=False)
+app(["schema", "--path"], standalone_mode=False)
+"""
+    said = run(program, site).split()
+    assert said == ["marble.usda", str(site / "refract_core" / "schemas")]
+    assert (tmp_path / "marble.png").read_bytes().startswith(b"\x89PNG")
+
+
 # --- where nothing can be built
 
 

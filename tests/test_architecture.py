@@ -19,10 +19,12 @@ PACKAGES = ("refract_core", "schemas", "service")
 ROOMS = {
     "pxr": ("refract_core.usd", "schemas", "service.precheck"),
     "embreex": ("refract_core.world.embree",),
-    "ctypes": ("refract_core.kernels.ahead", "refract_core.world.embree", "service"),
+    "ctypes": ("refract_core.images.denoise", "refract_core.kernels.ahead", "refract_core.world.embree", "service"),
     "llvmlite": ("refract_core.kernels",),
     "numba": ("refract_core.kernels.jit", "refract_core.kernels.linking", "refract_core.kernels.pointer_type"),
     "OpenImageIO": ("refract_core.images",),
+    "PIL": ("refract_core.images",),
+    "imageio_ffmpeg": ("refract_core.images.animation",),
     "MaterialX": ("refract_core.usd.layers.mtlx_file",),
     "pygltflib": ("refract_core.usd.convert.gltf_file",),
     "xatlas": ("refract_core.thickness.unwrap",),
@@ -41,8 +43,8 @@ ROOMS = {
 # The wings of the engine from the ground up: each may use those before it, and the records every wing speaks of.
 RECORDS = ("errors", "files", "models", "progress", "scene", "settings", "version")
 WINGS = (
-    "kernels", "optics", "images", "world", "probes", "view", "transport", "rendering", "thickness", "usd", "verbs",
-    "cli",
+    "kernels", "optics", "images", "studio", "world", "probes", "view", "transport", "rendering", "thickness", "usd",
+    "verbs", "cli",
 )  # fmt: skip
 # The same inside the wing that is a house of its own.
 USD_ROOMS = (

@@ -152,7 +152,7 @@ def test_a_place_that_cannot_be_written_is_one_error(tmp_path: Path) -> None:
     (tmp_path / "folder.png").mkdir()
     for out in (tmp_path / "missing" / "out.png", tmp_path / "file" / "out.png", tmp_path / "folder.png"):
         code, lines = refract(stage_path("no_camera"), out)
-        assert code == 1
+        assert code == 2
         assert len(lines) == 1
         assert lines[0].startswith("error: ")
         assert str(out) in lines[0]

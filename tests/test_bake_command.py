@@ -125,7 +125,7 @@ def test_wrong_words_are_refused_before_anything_is_written(
 
 def test_places_that_will_not_do(studio: Studio) -> None:
     assert run(studio.stage, studio.stage).exit_code == 2
-    assert run(studio.stage, studio.folder / "missing" / "out.usda").exit_code == 1
+    assert run(studio.stage, studio.folder / "missing" / "out.usda").exit_code == 2
     assert run(studio.folder / "missing.usda", studio.out()).exit_code == 1
     studio.out().write_text("#usda 1.0\n")
     ended = run(studio.stage, studio.out())

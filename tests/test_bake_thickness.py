@@ -314,6 +314,22 @@ def test_an_order_that_makes_no_sense_is_refused(options: dict[str, Any], text: 
         ThicknessOrder(stage="a.usda", out="b.usda", **options)
 
 
+def test_where_nothing_can_be_measured_that_is_said(tmp_path: Path) -> None:
+    """A thin pane alone: the layer is written, and nobody thinks that it says something."""
+    stage = new(tmp_path / "in.usda")
+    pane = mesh(stage, "/W/Pane", ball(1.0), glass(stage, "Thin", model="thin"))
+    stage.Save()
+    rows, told = run(tmp_path / "in.usda", tmp_path / "out.usda")
+    assert rows == {}
+    assert f"warning {tmp_path / 'out.usda'}: nothing was measured, and the layer changes nothing" in told
+    assert "the model of /W/Pane fixes the thickness; give it another" in told
+    bind(pane, glass(stage, "Thick"))
+    stage.Save()
+    rows, told = run(tmp_path / "in.usda", tmp_path / "out.usda")
+    assert list(rows) == ["Pane"]
+    assert "nothing was measured" not in told
+
+
 def test_a_stage_without_glass_gives_a_layer_that_changes_nothing(tmp_path: Path) -> None:
     stage = new(tmp_path / "in.usda")
     mesh(stage, "/W/Ball", ball(1.0))

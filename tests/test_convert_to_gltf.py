@@ -13,6 +13,7 @@ from material_reading import write_png
 from numpy.typing import NDArray
 from scenes import draw
 from test_convert import HEAD, ball, block, cone, glass, material, pane, run
+from test_convert import stage as bound
 from test_convert_pictures import AMBER, looks, mesh, vessel
 from test_convert_pictures import ball as lit_ball
 from test_convert_pictures import stage as pictured
@@ -21,7 +22,7 @@ from refract_core.errors import UsageError
 from refract_core.scene import Mesh, Model, Param, Scene
 from refract_core.usd.convert.gltf_write import quaternion
 from refract_core.usd.stage import load_stage
-from refract_core.verbs.convert import ConvertOrder
+from refract_core.verbs.convert import ConvertOrder, convert
 
 pytest.importorskip("pygltflib")
 
@@ -299,10 +300,37 @@ def test_what_out_is_says_its_name(tmp_path: Path) -> None:
         ConvertOrder(stage="a.usda", out="b.glb", to="openpbr")
     with pytest.raises(UsageError, match=r"end the name of OUT with \.mtlx"):
         ConvertOrder(stage="a.usda", out="b.usda", to="mtlx")
+    with pytest.raises(UsageError, match=r"end the name of OUT with \.mtlx"):
+        ConvertOrder(stage="a.usda", out="b.glb", to="mtlx")
     path = shop(tmp_path)
+    for name in ("out.txt", "out", ".glb", "glb"):
+        with pytest.raises(UsageError, match=r"\.usda.*\.usdz, \.glb, \.gltf, \.mtlx"):
+            run(path, tmp_path / name)
     (tmp_path / "there.glb").write_bytes(b"mine")
     with pytest.raises(UsageError, match="exists already"):
         run(path, tmp_path / "there.glb")
     assert (tmp_path / "there.glb").read_bytes() == b"mine"
     run(path, tmp_path / "there.glb", overwrite=True, to="gltf")
     assert document(tmp_path / "there.glb")["asset"]["version"] == "2.0"
+
+
+@pytest.mark.parametrize("name", ["out.glb", "out.mtlx"])
+def test_a_file_with_nothing_in_it_is_told(name: str, tmp_path: Path) -> None:
+    (tmp_path / "in.usda").write_text("#usda 1.0\n")
+    order = ConvertOrder(stage=str(tmp_path / "in.usda"), out=str(tmp_path / name))
+    told = [notice.text for notice in convert(order).notices]
+    assert any("there is nothing in the" in text for text in told), told
+
+
+def test_what_is_left_out_of_an_opaque_material_is_told(tmp_path: Path) -> None:
+    """It has no row, for it is no glass; what a file cannot say of it is lost all the same."""
+    worked = glass("Shiny", "int inputs:useSpecularWorkflow = 1", "color3f inputs:specularColor = (0.5, 0.4, 0.1)",
+                   "color3f inputs:diffuseColor.connect = </W/Looks/Shiny/V.outputs:result>")  # fmt: skip
+    reader = block('def Shader "V"', 'uniform token info:id = "UsdPrimvarReader_float3"',
+                   'string inputs:varname = "tints"', "float3 outputs:result")  # fmt: skip
+    path = bound(tmp_path, [f"{worked.removesuffix('}')}{reader}\n}}"], [ball("S", "Shiny", 1.0)])
+    made = convert(ConvertOrder(stage=path, out=str(tmp_path / "out.glb")))
+    assert not made.rows
+    texts = [notice.text for notice in made.notices if notice.path == "/W/Looks/Shiny"]
+    assert any("specular colour is left out" in text for text in texts), texts
+    assert any("primvar tints is left out" in text for text in texts), texts

@@ -149,3 +149,13 @@ def test_names_are_unique_and_the_stage_is_left_alone(tmp_path: Path) -> None:
     materials = [node.getName() for node in document.getMaterialNodes()]
     assert sorted(materials) == ["Ball", "Cone", "Pane", "Wall"]
     assert Path(path).read_bytes() == content
+
+
+def test_a_material_that_instances_share_is_one(tmp_path: Path) -> None:
+    one = 'def Xform "{}" (\n    instanceable = true\n    inherits = </Kind>\n)\n{{\n}}'
+    shared = glass("Amber").replace("/W/Looks/", "/Kind/")
+    text = block('class Xform "Kind"', shared) + "\n" + block('def Xform "W"', one.format("A"), one.format("B"))
+    path = tmp_path / "in.usda"
+    path.write_text(f'#usda 1.0\n(\n    defaultPrim = "W"\n)\n{text}\n')
+    assert list(run(str(path), tmp_path / "out.mtlx")) == ["Amber"]
+    assert [node.getName() for node in valid(tmp_path / "out.mtlx").getMaterialNodes()] == ["Amber"]

@@ -710,9 +710,11 @@ def test_brushed_metal_is_quieter_the_better_the_quality() -> None:
     assert noise[2] < 0.02
 
 
-@pytest.mark.parametrize("width", [0.55, 0.8])
-def test_wires_thinner_than_a_pixel_are_not_broken(width: float) -> None:
-    """Over half a pixel wide, so slanting that they pass between corners for many rows: every row has all of each."""
+@pytest.mark.parametrize("behind", [False, True])
+@pytest.mark.parametrize(("width", "apart"), [(0.3, 0.45), (0.55, 0.2), (0.8, 0.2)])
+def test_wires_thinner_than_a_pixel_are_not_broken(width: float, apart: float, behind: bool) -> None:
+    """So slanting that they pass between corners for many rows, thin ones between middles, too: every row has all of
+    each, as exactly as sixteen samples tell. And the same behind a slab of glass that bends nothing."""
     size, fov = 64, 1.0
     pixel = 2 * fov / size
     wires = [
@@ -721,11 +723,32 @@ def test_wires_thinner_than_a_pixel_are_not_broken(width: float) -> None:
     ]
     turn = turned((0, 1, 0), 3)
     wires = [replace(wire, points=(wire.points @ turn.T).astype(np.float32)) for wire in wires]
-    shining = [material("/white", EMISSIVE=1.0, DIFFUSE=0.0), material("/black", DIFFUSE=0.0, IOR=1.0)]
-    what = scene([quad("/floor", FLOOR), *wires], shining, cameras=(above(0.0, fov),))
+    slabs = [box("/slab", (20, 0.1, 20), 2, centre=(0, 1, 0))] if behind else []
+    kinds = [material("/white", EMISSIVE=1.0, DIFFUSE=0.0), material("/black", DIFFUSE=0.0, IOR=1.0)]
+    kinds.append(glass(Model.TRACED, 1.0))
+    what = scene([quad("/floor", FLOOR), *wires, *slabs], kinds, cameras=(above(0.0, fov),))
     lost = 1.0 - draw(what, size, size, **GOOD)["beauty"][..., 0]
-    assert lost.sum(1) == pytest.approx(6 * width / math.cos(math.radians(3)), rel=0.2)
+    assert lost.sum(1) == pytest.approx(6 * width / math.cos(math.radians(3)), rel=apart)
     assert lost.sum(1).mean() == pytest.approx(6 * width / math.cos(math.radians(3)), rel=0.03)
+
+
+def test_a_narrow_side_of_a_body_is_not_broken() -> None:
+    """A step in a sheet, seen from above: its slope is a third of a pixel wide, and of the same mesh as the rest."""
+    size, fov, slope = 64, 1.0, math.radians(75)
+    pixel = 2 * fov / size
+    x, step = 0.3 * pixel, 0.3 * pixel * math.tan(slope)
+    rows = np.array([[(-9, 0, z), (-x, 0, z), (x, 2 * step, z), (9, 2 * step, z)] for z in (9, -9)], np.float32)
+    points = (rows.reshape(-1, 3) @ turned((0, 1, 0), 3).T).astype(np.float32)
+    order = np.array([(k, k + 1, k + 5, k + 4) for k in range(3)])
+    sheet = Mesh("/sheet", points, order[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3), np.zeros(6, np.int32))
+    lamp = light(LightKind.DISTANT, (0, 9, 0), (0, -1, 0), (0.0, 0.0), 1.0)
+    dull = material("/dull", DIFFUSE=1.0, IOR=1.0)
+    picture = draw(scene([sheet], [dull], lights=(lamp,), cameras=(above(0.0, fov),)), size, size, **GOOD)
+    light_of = picture["beauty"][8:-8, :, 0] / picture["beauty"][8, 2, 0]
+    lost = (1.0 - light_of).sum(1)
+    expected = 0.6 * (1.0 - math.cos(slope)) / math.cos(math.radians(3))
+    assert lost.mean() == pytest.approx(expected, rel=0.06)
+    assert lost.min() > 0.6 * expected
 
 
 def test_glass_that_the_eye_passes_costs_no_samples() -> None:

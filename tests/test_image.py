@@ -182,21 +182,27 @@ def test_exr_holds_every_aov_under_its_name(tmp_path: Path) -> None:
     for name, aov in AOVS.items():
         values = frame.planes[name].reshape(HEIGHT, WIDTH, -1)
         for i, channel in enumerate(aov.channels):
-            expected = values[..., i].astype(np.float16) if aov.color else values[..., i]
+            expected = values[..., i] if name in ("Z", "P") else values[..., i].astype(np.float16)
             np.testing.assert_array_equal(found[channel], expected)
 
 
 def exr_planes(path: Path) -> dict[str, NDArray[np.float32]]:
-    """Channels of an EXR file, each with the precision it has in the file."""
+    """Channels of all parts of an EXR file, each with the precision it has in the file."""
     import OpenImageIO as oiio
 
     file = oiio.ImageInput.open(str(path))
     assert file is not None
-    spec = file.spec()
-    pixels = file.read_image(0, 0, 0, spec.nchannels, oiio.FLOAT)
+    found: dict[str, NDArray[np.float32]] = {}
+    part = 0
+    while file.seek_subimage(part, 0):
+        spec = file.spec()
+        pixels = file.read_image(part, 0, 0, spec.nchannels, oiio.FLOAT)
+        assert pixels is not None
+        assert not found.keys() & set(spec.channelnames)
+        found |= {name: pixels[..., i] for i, name in enumerate(spec.channelnames)}
+        part += 1
     file.close()
-    assert pixels is not None
-    return {name: pixels[..., i] for i, name in enumerate(spec.channelnames)}
+    return found
 
 
 def test_exr_metadata_and_chosen_aovs(tmp_path: Path) -> None:
@@ -366,9 +372,9 @@ def test_check_writable_knows_before_the_render(tmp_path: Path) -> None:
     check_writable(str(good))
     assert not list(tmp_path.iterdir())
     (tmp_path / "folder.png").mkdir()
-    with pytest.raises(ImageError, match="is a folder"):
+    with pytest.raises(UsageError, match="is a folder"):
         check_writable(str(tmp_path / "folder.png"))
-    with pytest.raises(ImageError, match=r"missing does not exist; make it"):
+    with pytest.raises(UsageError, match=r"missing does not exist; make it"):
         check_writable(str(tmp_path / "missing" / "a.png"))
     with pytest.raises(UsageError, match="extension"):
         check_writable(str(tmp_path / "a.docx"))

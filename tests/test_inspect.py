@@ -106,7 +106,8 @@ def test_json_has_the_shape_that_is_promised(tmp_path: Path) -> None:
         "settings", "cameras", "environment", "glass", "probes", "unsupported", "suspicious",
     }  # fmt: skip
     assert set(said["glass"][0]) == {
-        "path", "material", "by", "model", "ior", "thickness", "closed", "convex", "size", "layers", "tiers", "probes",
+        "path", "material", "by", "model", "ior", "roughness", "transmittance_color", "absorption_distance",
+        "thickness", "closed", "convex", "size", "layers", "tiers", "probes",
     }  # fmt: skip
     assert set(said["probes"][0]) == {"path", "mode", "planar", "texture", "resolution", "covers"}
     assert set(said["time"]) == {"start", "end", "authored", "frames_per_second"}
@@ -143,6 +144,24 @@ def test_where_a_thickness_comes_from(unit: float, up: str, tmp_path: Path) -> N
         [2 * unit, unit, 1.5 * unit]
     )
     assert said["/Thin"]["most"] == pytest.approx(0.005)
+
+
+@pytest.mark.parametrize("unit", [1.0, 0.01])
+def test_what_the_file_says_of_the_body_is_said(unit: float, tmp_path: Path) -> None:
+    """Everything that a person may override starts from what is authored."""
+    said = """token outputs:surface.connect = </A/Shader.outputs:surface>
+    def Shader "Shader" { uniform token info:id = "UsdPreviewSurface"
+        float inputs:roughness = 0.25
+        token outputs:surface }
+    color3f inputs:refraction:transmittanceColor = (0.5, 0.25, 1)
+    float inputs:refraction:absorptionDistance = 3"""
+    looks = MATERIAL % ("A", "sphere", said) + MATERIAL % ("P", "sphere", "")
+    text = ball("Amber", "A") + ball("Plain", "P") + looks
+    amber, plain = report(tmp_path, text, unit=unit)["glass"]
+    assert amber["transmittance_color"] == {"value": [0.5, 0.25, 1.0], "by": "constant"}
+    assert amber["absorption_distance"] == pytest.approx(3 * unit)
+    assert plain["transmittance_color"]["value"] == [1.0, 1.0, 1.0]  # clear, as the schema's fallback
+    assert amber["roughness"] == {"value": 0.25, "by": "constant"}
 
 
 def test_closed_and_convex(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from refract_core.kernels.compile import kernel
 from refract_core.kernels.lanes import LANES, by_address
 from refract_core.probes.digest import probe_digest
 from refract_core.probes.plan import plan_picture
-from refract_core.scene import Instances, LightKind, Mesh, Model, Paths, Probe, Run, Scene, Volume
+from refract_core.scene import Instances, LightKind, Mesh, Model, Paths, Probe, Run, Scene, Source, Volume
 from refract_core.world import embree
 from refract_core.world.embree import Packet
 from refract_core.world.instances import around, bounds_of, boxes, placed, settled
@@ -310,6 +310,24 @@ def test_a_digest_does_not_hang_on_the_order_of_places_but_on_each() -> None:
     assert digest(places((5, 0, 0), (0, 0, 0))) == first != digest(places((5, 0, 0), (0, 0, 1e-3)))
 
 
+def test_a_digest_does_not_hang_on_what_the_glass_of_places_reads() -> None:
+    """Of a mesh that is partly glass, each place has a colour for the glass and one for the rest."""
+    box_at = Volume(np.eye(4), False, (1.0, 1.0, 1.0))
+    probe = Probe("/probe", "baked", (0.0, 0.0, 0.0), box_at, box_at)
+    painted = material("/painted", DIFFUSE=Source(primvar="paint"))
+    stained = glass(Model.TRACED, DIFFUSE=Source(primvar="stain"))
+    ball = globe("/ball", 0.2, 0)
+    ball.materials[::2] = 1
+    of = scene([quad("/floor", SQUARE, 0)], [painted, stained])
+
+    def digest(**primvars: F32) -> str:
+        many = Instances(ball, places((0, 0, 0), (5, 0, 0)), Paths(("/a", "/b")), primvars)
+        return probe_digest(replace(of, instances=(many,)), probe)
+
+    one, other = np.full((2, 3), 0.5, np.float32), np.full((2, 3), 0.7, np.float32)
+    assert digest(paint=one, stain=one) == digest(paint=one, stain=other) != digest(paint=other, stain=one)
+
+
 # --- records ----------------------------------------------------------------------------------------------------------
 
 
@@ -382,6 +400,20 @@ def test_a_mesh_in_many_places_is_in_the_tables_once() -> None:
     geometry, bvh, _ = pack_geometry(of)
     assert len(geometry.points) == 4 + len(ball.points)
     assert geometry.first[1] == geometry.first[2] != geometry.first[3]
+    bvh.close()
+
+
+def test_what_places_say_is_in_the_tables_once() -> None:
+    """Of a mesh that is partly glass, too, which is two parts."""
+    ball = globe("/ball", 0.2, 0)
+    ball.materials[::2] = 1
+    own = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]], np.float32)
+    many = Instances(ball, places((0, 0, 0), (1, 0, 0)), Paths(("/a", "/b")), {"paint": own})
+    painted = Source(primvar="paint")
+    of = scene([quad("/floor", SQUARE, 0)], [material("/m", DIFFUSE=painted), glass(Model.TRACED, DIFFUSE=painted)])
+    geometry, bvh, _ = pack_geometry(replace(of, instances=(many,)))
+    assert geometry.primvars.tolist() == own.ravel().tolist()
+    assert geometry.primvar_first[:, 0].tolist() == [-1, 0, 0]
     bvh.close()
 
 

@@ -14,7 +14,7 @@ import refract_core as rc
 from refract_core.errors import StageError
 from refract_core.progress import Report
 from refract_core.rendering.picture import NOTHING_SEEN
-from refract_core.scene import Camera, Model, Scene, Sphere
+from refract_core.scene import Camera, Environment, Model, Scene, Sphere
 from refract_core.verbs.render_files import Order, render_files
 
 pytestmark = pytest.mark.draws
@@ -101,6 +101,22 @@ def test_a_picture_of_nothing_says_so() -> None:
 
     assert said(away)
     assert not said(EYE)
+
+
+def test_a_picture_far_above_white_says_what_exposure_shows_it() -> None:
+    """As of files that count lights in watts. At the exposure that is named nothing is said, and the middle is grey."""
+    for radiance in (0.5, 1e4):
+        what = replace(ball(2.0), environment=Environment(np.full((4, 8, 3), radiance, np.float32)))
+
+        def drawn(stops: float, what: Scene = what) -> rc.Frame:
+            return rc.render(what, rc.RenderSettings(image_width=16, samples=1, caustics=0, exposure=stops))
+
+        said = [notice.text for notice in drawn(0.0).notices if "--exposure" in notice.text]
+        assert bool(said) == (radiance > 3.0)
+        for text in said:
+            seen = drawn(float(text.split("--exposure ")[1].split()[0]))
+            assert not any("--exposure" in notice.text for notice in seen.notices)
+            assert 0.1 < np.median(seen.planes["beauty"][..., :3]) < 1.0
 
 
 def test_strict_fails_on_a_picture_of_nothing_and_writes_it_all_the_same(tmp_path: Path) -> None:

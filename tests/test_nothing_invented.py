@@ -96,8 +96,8 @@ def test_a_black_dome_covers_and_lights_nothing() -> None:
 def test_the_camera_light_is_said_and_can_be_left_out() -> None:
     wall = quad("/wall", [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], 0)
     what = scene([wall], [material("/grey", DIFFUSE=0.5)], camera_light=True)
-    on = rc.render(what, rc.RenderSettings(image_width=8, image_height=8, samples=1, jobs=1))
-    off = rc.render(what, rc.RenderSettings(image_width=8, image_height=8, samples=1, jobs=1, camera_light=False))
+    plain = rc.RenderSettings(image_width=8, image_height=8, samples=1, jobs=1, studio="none")
+    on, off = rc.render(what, plain), rc.render(what, replace(plain, camera_light=False))
     assert [n.text for n in on.notices if "--disable-camera-light" in n.text]
     assert on.planes["beauty"][4, 4, :3].min() > 0.1
     assert not off.notices

@@ -170,7 +170,7 @@ def test_http_points_at_what_the_engine_refuses() -> None:
     tasks = pytest.importorskip("service.tasks")
     for changes, where in (({"ior": 0.5}, "/overrides/~1a~0b/ior"), ({}, "/overrides/~1a~0b")):
         with pytest.raises(tasks.Problem) as caught:
-            tasks._override(scene(), {"/a~b": changes})
+            tasks.overridden(scene(), {"/a~b": changes})
         (error,) = caught.value.errors
         assert (caught.value.slug, caught.value.prim, error["pointer"]) == ("invalid-settings", "/a~b", where)
 

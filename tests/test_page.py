@@ -179,7 +179,8 @@ def test_the_page_knows_the_engines_words(module: Path) -> None:
 
 def test_settings_are_those_of_the_engine_and_what_is_usual_is_not_sent(module: Path) -> None:
     usual = js(module, "page.defaultSettings(null)")
-    assert set(usual) - set(RenderSettings.__dataclass_fields__) == {"overrides", "time_code"}
+    orbit = {"azimuth", "elevation", "distance", "look_at"}
+    assert set(usual) - set(RenderSettings.__dataclass_fields__) - orbit == {"overrides", "time_code"}
     known = {"camera", "samples", "exposure", "screen", "model", "max_layers", "image_height"}
     assert {name: usual[name] for name in known} == {name: getattr(RenderSettings(), name) for name in known}
     assert js(module, "page.requestSettings(page.defaultSettings(facts), facts)", facts=FACTS) == {"image_width": 480}
@@ -220,10 +221,43 @@ def test_a_link_brings_the_same_settings_back(module: Path) -> None:
     assert link["b"] == {"image_width": 480}
 
 
+def test_turning_keeps_to_the_sphere_and_a_move_to_the_plane_of_the_picture(module: Path) -> None:
+    view = {"azimuth": 170.0, "elevation": 80.0, "distance": 4.0, "look_at": [1.0, 2.0, 3.0]}
+    turned = js(module, "page.turned(view, 20, 30, 2)", view=view)
+    assert turned == {"azimuth": -170.0, "elevation": 89.0, "distance": 2.0, "look_at": [1.0, 2.0, 3.0]}
+    for up, axes in (("Y", (0, 1, 2)), ("Z", (0, 2, 1))):
+        front: dict[str, Any] = {"azimuth": 0, "elevation": 0, "distance": 4.0, "look_at": [1.0, 2.0, 3.0]}
+        moved = js(module, "page.moved(view, 0.5, 0.25, 0.5, up).look_at", view=front, up=up)
+        step = [after - before for after, before in zip(moved, front["look_at"], strict=True)]
+        assert [step[axis] for axis in axes] == pytest.approx([1.0, 0.5, 0.0])  # half, a quarter of 4 x 0.5 to see
+        side = {"azimuth": 90, "elevation": 0, "distance": 4.0, "look_at": [0.0, 0.0, 0.0]}
+        moved = js(module, "page.moved(view, 0.5, 0, 0.5, up).look_at", view=side, up=up)
+        assert moved[axes[2]] == pytest.approx(-1.0 if up == "Y" else 1.0)  # from +X, the right is the back
+
+
+def test_a_small_picture_asks_for_the_same_but_less(module: Path) -> None:
+    request = {"image_width": 960, "samples": 64, "ior": 1.3, "azimuth": 5, "camera": "/C"}
+    small = js(module, "page.smallRequest(request, 2)", request=request)
+    kept = {"ior": 1.3, "azimuth": 5, "camera": "/C"}
+    assert small == {"image_width": 320, "image_height": 160, "quality": "draft", "samples": 1, **kept}
+
+
+def test_small_pictures_become_as_large_as_is_quick_enough(module: Path) -> None:
+    """Time goes with the pixels: so sized that one takes a tenth of a second, within bounds."""
+    settled = """(() => {
+        let width = 320;
+        for (let turn = 0; turn < 20; turn++) width = page.nextWidth(width, width * width * perPixel);
+        return width;
+    })()"""
+    for milliseconds, expected in ((1, 320), (100, 320), (400, 160), (100_000, 128)):
+        assert js(module, settled, perPixel=milliseconds / 320**2) == pytest.approx(expected, abs=2)
+
+
 @pytest.mark.parametrize(
     "given",
     [None, 7, "x", [], {"tiers": "ray"}, {"tiers": ["moon"]}, {"screen": "__proto__"}, {"samples": "9"}, {"model": 3},
-     {"overrides": {"not/a/path": {"ior": 2}}}, {"overrides": {"/W": {"ior": "2", "evil": 1}}}, {"unknown": 1}],
+     {"overrides": {"not/a/path": {"ior": 2}}}, {"overrides": {"/W": {"ior": "2", "evil": 1}}}, {"unknown": 1},
+     {"azimuth": "9"}, {"look_at": [1, 2]}, {"look_at": "/World"}, {"look_at": [1, 2, "3"]}],
 )  # fmt: skip
 def test_a_hand_made_link_cannot_bring_other_things(module: Path, given: Any) -> None:
     same = "JSON.stringify(page.cleanSettings(given, null)) === JSON.stringify(page.defaultSettings(null))"
@@ -278,12 +312,12 @@ def test_cli_command_is_one_that_the_command_line_takes(module: Path, tmp_path: 
     assert taken["exposure"] == -1.5
     assert taken["frames"] == "3"
     assert {name: taken[name] for name in ("samples", "model", "camera")} == {
-        "samples": 2, "model": "thin", "camera": "/World/Camera",
+        "samples": 2, "model": "thin", "camera": ["/World/Camera"],
     }  # fmt: skip
 
 
 def test_cli_command_says_overrides_as_http_does(module: Path, tmp_path: Path) -> None:
-    from refract_core.cli.render import _materials
+    from refract_core.cli.render import materials_of
 
     override = {"ior": 1.7, "thickness": 2.5, "model": "box", "roughness": 1e-7, "transmittanceColor": [1, 0.5, 0.25]}
     request = {"image_width": 64, "overrides": {"/L/It's 'Glass'": override, "/L/Ω": {"ior": 2}}}
@@ -293,7 +327,7 @@ def test_cli_command_says_overrides_as_http_does(module: Path, tmp_path: Path) -
     assert words[:5] == ["render", "glass.usda", "glass.png", "--image-width", "64"]
     given = [value for word, value in pairwise(words) if word == "--override"]
     expected = {"/L/It's 'Glass'": {**override, "transmittanceColor": (1, 0.5, 0.25)}, "/L/Ω": {"ior": 2}}
-    assert _materials(given) == expected
+    assert materials_of(given) == expected
 
 
 def chunks(png: bytes) -> list[bytes]:

@@ -28,6 +28,7 @@ PATIENCE = 60_000
 playwright.expect.set_options(timeout=PATIENCE)
 NEVER = 3600.0
 """[s] A render that takes as long shows 0 % of progress in every test."""
+DONE, BOTH_DONE = "Done in 1.9 s.", "A done in 1.9 s; B done in 1.9 s."
 MIDDLE = "id => [...document.getElementById(id).getContext('2d').getImageData(32, 18, 1, 1).data]"
 CONTROLS = r"^\s*- (button|textbox|combobox|slider|spinbutton|checkbox|radio|progressbar)\b(?! \")"
 
@@ -74,9 +75,13 @@ def until(page: Any, true: Callable[[], bool]) -> None:
         page.wait_for_timeout(20)
 
 
+def choose(page: Any, name: str = "ball.usda") -> None:
+    page.get_by_role("button", name=name.removesuffix(".usda"), exact=True).click()
+
+
 def pick(page: Any, name: str = "ball.usda") -> None:
-    page.get_by_label("Or a sample").select_option(name)
-    status(page, "Done.")
+    choose(page, name)
+    status(page, DONE)
     page.wait_for_selector("#canvas-a:visible")
 
 
@@ -88,10 +93,10 @@ def asked(service: FakeService) -> Any:
 
 
 def test_upload_render_and_change_a_slider(page: Any, service: FakeService) -> None:
-    page.get_by_label("Drop a USD file here").set_input_files(
+    page.get_by_label("Drop a USD or glTF file here").set_input_files(
         {"name": "mine.usdz", "mimeType": "model/vnd.usdz+zip", "buffer": b"anything"}
     )
-    status(page, "Done.")
+    status(page, DONE)
     page.wait_for_selector("#canvas-a:visible")
     assert asked(service) == {"stage": "mine.usdz", "image_width": 480}
     before = page.evaluate(MIDDLE, "canvas-a")
@@ -102,21 +107,68 @@ def test_upload_render_and_change_a_slider(page: Any, service: FakeService) -> N
     assert page.get_by_role("img").get_attribute("aria-label") == "picture of mine.usdz, setting A, 64 by 36 pixels"
 
 
+CORNER = "node => [...node.getContext('2d').getImageData(9, 9, 1, 1).data]"
+
+
+def shows(canvas: Any, colour: list[int]) -> bool:
+    return bool(canvas.evaluate(CORNER) == colour)
+
+
+def test_the_first_screen_is_pictures_of_the_stages(page: Any, service: FakeService) -> None:
+    """One that lies beside a stage is shown as it is, another is drawn; parts of stages are names alone."""
+    cards = page.locator("#gallery canvas")
+    assert cards.count() == 2
+    for place, colour in enumerate(([200, 80, 40, 255], [40, 80, 200, 255])):
+        until(page, partial(shows, cards.nth(place), colour))
+    assert service.asked("GET", "/v1/thumbnails/ball.usda") == []
+    assert page.locator("#settings").is_hidden()
+    page.get_by_text("1 other file").click()
+    page.get_by_role("button", name="parts/wall.usda").click()
+    status(page, DONE)
+    assert asked(service)["stage"] == "parts/wall.usda"
+    assert page.locator("#gallery").is_hidden()
+    page.get_by_role("button", name="Another stage").press("Enter")
+    assert page.locator("#gallery").is_visible()
+    pick(page, "room.usda")
+    assert page.locator("#gallery").is_hidden()
+
+
+def test_sliders_start_from_what_the_file_says(page: Any, service: FakeService) -> None:
+    pick(page)
+    shown = {name: page.get_by_label(f"Ball: {label}, slider").input_value() for name, label in (
+        ("ior", "Index of refraction"), ("roughness", "Roughness"), ("thickness", "Thickness, scene units"),
+        ("absorptionDistance", "Absorption distance, scene units"),
+    )}  # fmt: skip
+    assert {name: float(value) for name, value in shown.items()} == pytest.approx(
+        {"ior": 1.5, "roughness": 0.25, "thickness": 0.5, "absorptionDistance": 0.75}, abs=0.002
+    )
+    assert page.locator("#glass-0-roughness").get_attribute("placeholder") == "0.25"
+    authored = page.locator("#glass-0-transmittanceColor").input_value()
+    linear = page.evaluate("async (hex) => (await import('/static/glass.js')).linearOf(hex)", authored)
+    assert linear == pytest.approx([0.5, 0.25, 1.0], abs=0.005)
+    page.get_by_role("group", name="Ball").get_by_label("Other absorption colour").check()
+    status(page, DONE)
+    until(page, lambda: "overrides" in asked(service))
+    assert asked(service)["overrides"]["/World/Looks/Ball"]["transmittanceColor"] == linear
+
+
 def test_a_file_can_be_dropped_anywhere(page: Any, service: FakeService) -> None:
     page.evaluate("""() => {
         const data = new DataTransfer();
         data.items.add(new File(['x'], 'dropped.usda'));
         document.body.dispatchEvent(new DragEvent('drop', {dataTransfer: data, bubbles: true, cancelable: true}));
     }""")
-    status(page, "Done.")
+    status(page, DONE)
     assert asked(service)["stage"] == "dropped.usda"
 
 
 def test_progress_is_told_and_cancel_ends_the_job(page: Any, service: FakeService) -> None:
     service.seconds = NEVER
-    page.get_by_label("Or a sample").select_option("ball.usda")
-    status(page, "Rendering, 0 %.")
+    choose(page)
+    status(page, "Rendering.")
     assert page.get_by_role("progressbar").is_visible()
+    playwright.expect(page.locator("#picture")).to_contain_text(re.compile(r"tiles, 0 %"))
+    assert len(re.findall("%", page.locator("#picture").inner_text())) == 1  # one number says how far it is
     page.get_by_role("button", name="Cancel").click()
     status(page, "Cancelled.")
     assert page.evaluate("document.activeElement.id") == "render"
@@ -124,16 +176,16 @@ def test_progress_is_told_and_cancel_ends_the_job(page: Any, service: FakeServic
     until(page, lambda: job.cancelled)
     service.seconds = 0.1
     page.get_by_role("button", name="Render", exact=True).click()
-    status(page, "Done.")
+    status(page, DONE)
 
 
 def test_a_changed_mind_leaves_no_job_behind(page: Any, service: FakeService) -> None:
     service.seconds = NEVER
-    page.get_by_label("Or a sample").select_option("ball.usda")
-    status(page, "Rendering, 0 %.")
+    choose(page)
+    status(page, "Rendering.")
     service.seconds = 0.1
     page.get_by_label("Camera", exact=True).select_option("/World/Far")
-    status(page, "Done.")
+    status(page, DONE)
     until(page, lambda: [job.cancelled for job in service.jobs.values()] == [True, False])
 
 
@@ -147,7 +199,7 @@ def test_a_refusal_names_the_field_and_leads_to_it(page: Any) -> None:
     alert.get_by_role("link", name="/samples").click()
     assert page.evaluate("document.activeElement.id") == "set-samples"
     page.get_by_label("Samples per pixel").fill("8")
-    status(page, "Done.")
+    status(page, DONE)
     assert alert.is_hidden()
     assert page.locator("#set-samples").get_attribute("aria-invalid") is None
 
@@ -163,18 +215,19 @@ def test_a_failed_job_shows_its_problem_and_keeps_the_last_picture(page: Any) ->
 
 
 def test_a_stage_that_cannot_be_opened_is_said_to_be_so(page: Any) -> None:
-    page.get_by_label("Drop a USD file here").set_input_files(
+    page.get_by_label("Drop a USD or glTF file here").set_input_files(
         {"name": "broken.usda", "mimeType": "text/plain", "buffer": b"no"}
     )
     playwright.expect(page.get_by_role("alert")).to_contain_text("broken.usda is not a USD file.")
-    assert page.get_by_role("button", name="Render", exact=True).is_disabled()
+    playwright.expect(page.get_by_role("button", name="Render", exact=True)).to_be_hidden()
     status(page, "Pick a stage to begin.")
+    assert page.get_by_role("button", name="ball", exact=True).is_visible()  # the choice is back
 
 
 def test_nothing_stays_of_a_stage_once_another_cannot_be_opened(page: Any) -> None:
     pick(page)
     assert page.locator("#glass [data-path]").count() > 0
-    page.get_by_label("Drop a USD file here").set_input_files(
+    page.get_by_label("Drop a USD or glTF file here").set_input_files(
         {"name": "broken.usda", "mimeType": "text/plain", "buffer": b"no"}
     )
     status(page, "Pick a stage to begin.")
@@ -184,7 +237,7 @@ def test_nothing_stays_of_a_stage_once_another_cannot_be_opened(page: Any) -> No
 def test_a_picture_with_notices_says_so(page: Any) -> None:
     pick(page)
     page.get_by_label("Samples per pixel").fill("2")
-    status(page, "Done with 1 notice, below.")
+    status(page, "Done in 1.9 s with 1 notice, below.")
     page.get_by_text("Notices (2)").click()
     playwright.expect(page.locator("#notices-list")).to_contain_text("/World/Block: drawn unrefined")
 
@@ -192,7 +245,7 @@ def test_a_picture_with_notices_says_so(page: Any) -> None:
 def test_two_settings_and_one_slider(page: Any, service: FakeService) -> None:
     pick(page)
     page.get_by_label("Ready-made comparison").select_option("model")
-    status(page, "A done; B done.")
+    status(page, BOTH_DONE)
     page.wait_for_selector("#canvas-b:visible")
     first, *both = [body.get("model") for body in service.asked("POST", "/v1/render")]
     assert (first, set(both), len(both)) == (None, {"sphere", "traced"}, 2)  # which of the two comes first, nobody says
@@ -205,7 +258,7 @@ def test_two_settings_and_one_slider(page: Any, service: FakeService) -> None:
     assert slider.input_value() == "25"
     page.get_by_label("Edit B").check()
     page.get_by_label("Samples per pixel").fill("7")
-    status(page, "A done; B done.")
+    status(page, BOTH_DONE)
     assert asked(service) == {"stage": "ball.usda", "image_width": 480, "model": "traced", "samples": 7}
     page.get_by_label("Compare A with B").uncheck()
     assert page.locator("#canvas-b").is_hidden()
@@ -228,7 +281,7 @@ def test_tier_order_by_keyboard(page: Any, service: FakeService) -> None:
     playwright.expect(page.locator("#tiers li").first).to_contain_text("1. probe")
     assert page.evaluate("document.activeElement.id") == "tier-probe"  # up is off now; the row keeps the focus
     page.get_by_label("ray (not asked)").press(" ")
-    status(page, "Done.")
+    status(page, DONE)
     assert asked(service)["tiers"] == ["probe", "screen", "sky", "ray"]
 
 
@@ -236,24 +289,115 @@ def test_tier_order_by_dragging(page: Any, service: FakeService) -> None:
     pick(page)
     page.locator("#tiers li").nth(2).drag_to(page.locator("#tiers li").nth(0))
     playwright.expect(page.locator("#tiers li").first).to_contain_text("1. sky")
-    status(page, "Done.")
+    status(page, DONE)
     assert asked(service)["tiers"] == ["sky", "screen", "probe"]
+
+
+def turned(service: FakeService) -> Any:
+    ours = ("azimuth", "elevation", "distance", "camera")
+    return {name: value for name, value in asked(service).items() if name in ours}
+
+
+def drag(page: Any, right: int, down: int) -> None:
+    box = page.locator("#views").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + right, y + down, steps=4)
+    page.mouse.up()
+
+
+def small(service: FakeService) -> list[Any]:
+    """Requests for small pictures."""
+    asked = service.asked("POST", "/v1/render") + service.asked("POST", "/v1/live/")
+    return [body for body in asked if body.get("quality") == "draft"]
+
+
+@pytest.mark.parametrize("viewer", ["a", ""], ids=["by a viewer", "where there is no place for one"])
+def test_dragging_turns_the_camera_with_small_pictures_on_the_way(
+    page: Any, service: FakeService, viewer: str
+) -> None:
+    """From where the stage's camera stands, which the job of the first picture has told."""
+    service.viewer = viewer
+    pick(page)
+    drag(page, -50, 25)
+    until(page, lambda: not small_last(service) and "azimuth" in asked(service))
+    status(page, DONE)
+    expected = {"camera": "/World/Near", "azimuth": 30.0, "elevation": 30.0, "distance": 4.0}
+    assert turned(service) == pytest.approx(expected)
+    on_the_way = small(service)
+    assert on_the_way
+    assert bool(service.asked("POST", "/v1/live/")) is bool(viewer)
+    for body in on_the_way:
+        assert 128 <= body["image_width"] <= 320
+        assert body["image_height"] == pytest.approx(body["image_width"] * 36 / 64, abs=0.5)
+    assert on_the_way[-1]["azimuth"] == pytest.approx(30.0)  # the last of them is of where it stands
+    assert page.locator("#set-azimuth").input_value() == "30"
+    page.get_by_role("button", name="Camera back").click()
+    status(page, "Changed, about to render.")
+    status(page, DONE)
+    assert turned(service) == {}
+
+
+def test_a_viewer_that_has_ended_is_followed_by_another(page: Any, service: FakeService) -> None:
+    pick(page)
+    drag(page, -50, 0)
+    until(page, lambda: len(service.asked("POST", "/v1/live/a/")) > 0)
+    status(page, DONE)
+    service.viewer = "b"
+    drag(page, -50, 0)
+    until(page, lambda: len(service.asked("POST", "/v1/live/b/")) > 0)
+    status(page, DONE)
+    assert [body["stage"] for how, path, body in service.log if path == "/v1/live"] == ["ball.usda", "ball.usda"]
+    page.get_by_role("button", name="Another stage").click()
+    pick(page, "room.usda")
+    until(page, lambda: service.asked("DELETE", "/v1/live/b") == [None])  # its place is for others
+
+
+def small_last(service: FakeService) -> bool:
+    return service.asked("POST", "/v1/render")[-1].get("quality") == "draft"
+
+
+def test_the_wheel_and_keys_move_the_camera_too(page: Any, service: FakeService) -> None:
+    pick(page)
+    page.locator("#views").hover()
+    page.mouse.wheel(0, -100)
+    until(page, lambda: not small_last(service) and "distance" in asked(service))
+    nearer = turned(service)["distance"]
+    assert nearer < 4.0
+    status(page, DONE)
+    page.locator("#views").press("ArrowRight")
+    until(page, lambda: not small_last(service) and asked(service).get("azimuth") == 15.0)
+    status(page, DONE)
+    page.locator("#views").press("Home")
+    until(page, lambda: not small_last(service) and turned(service) == {})
+    status(page, DONE)
+
+
+def test_both_sides_of_a_comparison_are_seen_by_one_camera(page: Any, service: FakeService) -> None:
+    pick(page)
+    page.get_by_label("Ready-made comparison").select_option("model")
+    status(page, BOTH_DONE)
+    page.get_by_label("Azimuth, degrees").fill("40")
+    until(page, lambda: [body.get("azimuth") for body in service.asked("POST", "/v1/render")[-2:]] == [40, 40])
+    status(page, BOTH_DONE)
+    assert {body["model"] for body in service.asked("POST", "/v1/render")[-2:]} == {"sphere", "traced"}
 
 
 def test_a_link_opens_the_same_view(page: Any, service: FakeService) -> None:
     pick(page, "room.usda")
-    page.get_by_role("group", name="Ball").get_by_label("Absorption colour").check()
+    page.get_by_role("group", name="Ball").get_by_label("Other absorption colour").check()
     page.locator("#glass-0-transmittanceColor").fill("#ff0000")
     page.get_by_label("Ready-made comparison").select_option("screen")
-    status(page, "A done; B done.")
+    status(page, BOTH_DONE)
     before = set(service.jobs)
     page.get_by_role("button", name="Copy link").click()
     link = page.get_by_label(re.compile("^Link")).input_value()
     other = page.context.new_page()
     other.goto(link)
-    status(other, "A done; B done.")
+    status(other, BOTH_DONE)
     playwright.expect(other.locator("#canvas-b")).to_be_visible()
-    assert other.locator("#sample").input_value() == "room.usda"
+    playwright.expect(other.locator("#facts")).to_contain_text("room.usda:")
     assert other.locator("#glass-0-transmittanceColor").input_value() == "#ff0000"
     assert asked(service)["overrides"] == {"/World/Looks/Ball": {"transmittanceColor": [1, 0, 0]}}
     assert set(service.jobs) == before  # the link's two renders are those that were there: same request, same job
@@ -267,7 +411,7 @@ def test_commands_are_copied(page: Any) -> None:
     assert page.locator("#copied").input_value() == "refract render ball.usda ball.png --image-width 480"
     assert page.evaluate("document.activeElement.id") == "copied"
     page.get_by_label("Ball: Index of refraction, slider").press("ArrowRight")
-    status(page, "Done.")
+    status(page, DONE)
     page.get_by_role("button", name="Copy as CLI").click()
     assert page.locator("#copied").input_value().endswith(" --override /World/Looks/Ball.ior=1.51")
 
@@ -352,7 +496,8 @@ def test_against_the_real_service(browser: Any, real_url: str) -> None:
     opened = browser.new_page()
     opened.set_default_timeout(PATIENCE)
     opened.goto(f'{real_url}#stage=marble.usda&a={{"image_width":64,"samples":1}}')
-    done = lambda: playwright.expect(opened.locator("#status")).to_have_text("Done.", timeout=900_000)  # noqa: E731
+    took = re.compile(r"^Done in [\d.]+ s\.$")
+    done = lambda: playwright.expect(opened.locator("#status")).to_have_text(took, timeout=900_000)  # noqa: E731
     done()  # the first worker may have to compile its kernels
     opened.wait_for_selector("#canvas-a:visible")
     assert opened.evaluate("document.getElementById('canvas-a').width") == 64

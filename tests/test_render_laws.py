@@ -262,7 +262,7 @@ def test_arms_preset_is_one_interface_and_a_corrected_cubemap() -> None:
     """A ball in a room with a probe whose proxy is the room, against the closed form: from the ball's surface along the
     refracted ray to the wall. What stands behind the ball, of glass too, is not there, and the ball absorbs nothing."""
     preset = named_settings(preset="arm")
-    engine = {"caustics": 0, "emission_light": False}
+    engine = {"caustics": 0, "emission_light": False, "studio": "none"}
     assert preset == {"model": "single", "tiers": ("probe", "sky"), "max_layers": 1, **engine}
     walls, materials = position_room()
     stuff = glass(Model.TRACED, 1.5, TRANSMITTANCE=0.2, absorption_distance=0.1)

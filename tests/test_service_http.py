@@ -274,9 +274,10 @@ def test_a_part_of_a_result_can_be_asked_for(client: httpx.Client) -> None:
 def test_livez_readyz_limits_stages(client: httpx.Client) -> None:
     assert client.get("/livez").json() == {"status": "alive"}
     assert client.get("/readyz").json()["confinement"]["threads"] == 1
-    assert {"path": "marble.usda", "bytes": (GOOD / "marble.usda").stat().st_size} in client.get("/v1/stages").json()[
-        "stages"
-    ]
+    stages = {one["path"]: one for one in client.get("/v1/stages").json()["stages"]}
+    size = (GOOD / "marble.usda").stat().st_size
+    assert stages["marble.usda"] == {"path": "marble.usda", "bytes": size, "picture": "/v1/pictures/marble.usda"}
+    assert stages["parts/studio.usda"]["picture"] == ""
     limits = client.get("/v1/limits").json()
     assert {row["name"]: row["value"] for row in limits["limits"]}["samples"] == 64
 

@@ -99,6 +99,42 @@ def test_a_wrong_query_is_told_by_its_parameter(tmp_path: Path, query: str, poin
     assert [one["pointer"] for one in answer.json()["errors"]] == [pointer]
 
 
+# --- pictures beside stages
+
+
+@pytest.fixture
+def gallery(tmp_path: Path) -> Path:
+    """A stage root: a stage with a picture, one without, one whose picture is a link that leads out, one too large."""
+    root = tmp_path / "root"
+    root.mkdir()
+    for name in ("shown", "plain", "leading", "huge"):
+        (root / f"{name}.usda").write_text(BALL)
+    (tmp_path / "secret.png").write_bytes(b"secret")
+    (root / "shown.png").write_bytes(b"a picture")
+    (root / "leading.png").symlink_to(tmp_path / "secret.png")
+    (root / "huge.png").write_bytes(bytes(2000))
+    (root / "alone.png").write_bytes(b"no stage of this name")
+    return root
+
+
+def test_a_picture_beside_a_stage_is_listed_and_sent_as_it_is(gallery: Path, tmp_path: Path) -> None:
+    limits = Limits(result_bytes=1000)
+    client = InProcess(create_app(Settings(data=str(tmp_path / "data"), stage_root=str(gallery), limits=limits)))
+    listed = {one["path"]: one["picture"] for one in client.get("/v1/stages").json()["stages"]}
+    assert listed == {"shown.usda": "/v1/pictures/shown.usda", "plain.usda": "", "leading.usda": "", "huge.usda": ""}
+    first = client.get(listed["shown.usda"])
+    assert (first.content, first.headers["content-type"]) == (b"a picture", "image/png")
+    assert first.headers["cache-control"] == "public, max-age=300"
+    again = client.get("/v1/pictures/shown.usda", headers={"If-None-Match": first.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+    for hidden in ("plain", "leading", "huge"):
+        assert client.get(f"/v1/pictures/{hidden}.usda").status_code == 404
+    for wrong in ("alone.usda", "alone.png", "shown.png", "%2e%2e/secret.usda", "%2e%2e/secret.png"):
+        assert client.get(f"/v1/pictures/{wrong}").status_code in (404, 422)
+    (gallery / "shown.png").write_bytes(b"another picture")
+    assert client.get("/v1/pictures/shown.usda", headers={"If-None-Match": first.headers["etag"]}).status_code == 200
+
+
 # --- the service
 
 

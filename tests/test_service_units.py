@@ -17,7 +17,7 @@ from service_stages import HEAD, escapes, laughs, referring
 
 from refract_core.errors import UsageError
 from refract_core.images.aovs import AOVS
-from refract_core.settings import MODELS, PRESETS, PURPOSES, QUALITIES, SCREEN_METHODS, TIERS, RenderSettings
+from refract_core.settings import INDIRECT, MODELS, PRESETS, PURPOSES, QUALITIES, SCREEN_METHODS, TIERS, RenderSettings
 from service import confine, models, precheck, problems, tasks
 from service.app import Settings, create_app
 from service.bodies import check, parse
@@ -54,9 +54,12 @@ def test_the_models_have_the_engines_words() -> None:
     assert get_args(models.Tier) == TIERS
     assert get_args(models.Purpose) == PURPOSES
     assert get_args(models.Aov) == tuple(AOVS)
-    known = {one.name for one in fields(RenderSettings)} - {"jobs", "tile_size"}
+    # Features are in aovs; HTTP sends no mattes and no parts of pictures, and reads no file of the server's.
+    left_out = {"jobs", "tile_size", "features", "cryptomatte", "crop", "tile_count", "tile_index", "environment"}
+    known = {one.name for one in fields(RenderSettings)} - left_out
     assert known <= models.Render.model_fields.keys()
-    for field, words in (("screen", SCREEN_METHODS), ("quality", QUALITIES), ("preset", PRESETS)):
+    tokens = {"screen": SCREEN_METHODS, "quality": QUALITIES, "preset": PRESETS, "indirect": INDIRECT}
+    for field, words in tokens.items():
         assert get_args(get_args(models.Render.model_fields[field].annotation)[0]) == tuple(words)
 
 
@@ -69,6 +72,7 @@ def test_the_models_have_the_engines_words() -> None:
         ({"camera": "a\0b"}, "/camera"), ({"overrides": {"/a/b": {"ior": 0.5}}}, "/overrides/~1a~1b/ior"),
         ({"overrides": {"/a": {"colour": 1}}}, "/overrides/~1a/colour"), ({"image_width": 0}, "/image_width"),
         ({"overrides": {"/a": {"transmittanceColor": [1, 1]}}}, "/overrides/~1a/transmittanceColor"),
+        ({"indirect": "half"}, "/indirect"), ({"indirect": 1}, "/indirect"),
         ({"time_code": True}, "/time_code"), ([], ""), (None, ""), ("x", ""),
     ],
 )  # fmt: skip

@@ -13,8 +13,8 @@ from scene_reading import CUBE, F64, read, stage_of, texts, to_stage
 
 from refract_core.errors import UsageError
 from refract_core.scene import Camera, Scene
-from refract_core.usd.camera import frame_everything, see_everything
 from refract_core.usd.stage import scene_from_stage
+from refract_core.view.orbit import see_everything
 
 
 def camera_text(name: str = "Cam", extra: str = "") -> str:
@@ -338,18 +338,3 @@ def test_the_camera_that_a_stage_was_saved_with_comes_before_the_first() -> None
     scene = read(SEVERAL, head=SAVED.replace("/OmniverseKit_Persp", "/b"))
     assert scene.cameras[0].path == "/b"
     assert read(SEVERAL, head=SAVED).cameras[0].path == "/X/deep"
-
-
-def test_what_is_flat_in_depth_is_seen_from_where_usdrecord_sees_it() -> None:
-    """The field of view spans the diagonal of the front face (UsdAppUtilsFrameRecorder): for a 4 x 3 x 2 box and 50 mm
-    over 20.955 mm that is 2.5 / tan(half) + 1 in front of the centre."""
-    camera = frame_everything(((-2, -1.5, -1), (2, 1.5, 1)))
-    half = math.atan(20.955 / 2 / 50)
-    assert camera.world_from_camera[:3, 3] == pytest.approx((0, 0, 2.5 / math.tan(half) + 1))
-    assert camera.world_from_camera[:3, :3] == pytest.approx(np.eye(3))
-
-
-def test_a_tall_stage_is_not_cut() -> None:
-    """A 0 x 4 front face just fills the height: 2 / tan of half the vertical field of view."""
-    camera = frame_everything(((0, -2, 0), (0, 2, 0)))
-    assert camera.world_from_camera[2, 3] == pytest.approx(2 * 50 / (15.2908 / 2))

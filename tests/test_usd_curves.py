@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 from pxr import Usd, UsdGeom, Vt
-from scene_reading import F64, areas, read, signed_volume, stage_of, texts, to_stage
+from scene_reading import F64, WALL_SEEN, areas, read, signed_volume, stage_of, texts, to_stage
 
 import refract_core as rc
 from refract_core.scene import F32, Mesh, Model, Scene
@@ -507,23 +507,10 @@ def test_a_fibre_beside_fur_stays_round() -> None:
     assert len(fibre.triangles) >= 4 * 24
 
 
-
 # --- glass ----------------------------------------------------------------------------------------------------------
 
-_ROOM = """
+_ROOM = WALL_SEEN + """
 def DistantLight "L" { float inputs:intensity = 50000 }
-def Mesh "Wall" {
-    uniform token subdivisionScheme = "none"
-    int[] faceVertexCounts = [4, 4, 4, 4]
-    int[] faceVertexIndices = [0, 1, 4, 3, 1, 2, 5, 4, 3, 4, 7, 6, 4, 5, 8, 7]
-    point3f[] points = [(-4, -4, -3), (0, -4, -3), (4, -4, -3), (-4, 0, -3), (0, 0, -3), (4, 0, -3), (-4, 4, -3),
-        (0, 4, -3), (4, 4, -3)]
-    color3f[] primvars:displayColor = [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0)] (interpolation = "uniform") }
-def Camera "Cam" {
-    double3 xformOp:translate = (0.3, 0.2, 8)
-    uniform token[] xformOpOrder = ["xformOp:translate"]
-    float2 clippingRange = (0.1, 100)
-    float focalLength = 60 }
 def Material "Glass" {
     token outputs:surface.connect = </Glass/S.outputs:surface>
     def Shader "S" {

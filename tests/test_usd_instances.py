@@ -251,6 +251,23 @@ def test_nested_instancers_are_one_level_of_transforms(monkeypatch: pytest.Monke
     assert "/Outer/[1]/Q/[2]/Leaf" in next(one for one in scene.instances if one.mesh.path.endswith("Leaf")).paths
 
 
+def test_an_instancer_that_two_others_draw_has_its_colours_in_both(monkeypatch: pytest.MonkeyPatch) -> None:
+    colours = [(k / 6, 0.5, 0.25) for k in range(6)]
+    extra = f'color3f[] primvars:displayColor = {colours} ( interpolation = "vertex" )'
+    inner = many(6, extra).replace('"P"', '"Q"').replace("</P/", "</Library/Q/")
+    outer = "".join(
+        f"""def PointInstancer "{name}" {{
+            int[] protoIndices = [0]
+            point3f[] positions = [({x}, 0, 0)]
+            rel prototypes = </Library/Q> }}"""
+        for name, x in (("A", 0), ("B", 50))
+    )
+    scene = check_both(f'class Scope "Library" {{ {inner} }} {outer}', monkeypatch)
+    (leaf,) = (one for one in scene.instances if one.mesh.path.endswith("Leaf"))
+    assert [leaf.paths[0], leaf.paths[3]] == ["/A/[0]/Q/[0]/Leaf", "/B/[0]/Q/[0]/Leaf"]
+    np.testing.assert_allclose(leaf.primvars["displayColor"][[0, 1, 3, 4], 0], [0, 2 / 6, 0, 2 / 6], atol=1e-6)
+
+
 def test_native_instances_share_a_mesh_by_how_they_look(monkeypatch: pytest.MonkeyPatch) -> None:
     """Six, two of which are red by what is said around them; one holds its own paths."""
     places = "".join(

@@ -176,8 +176,12 @@ def test_a_mask_may_name_what_only_a_chosen_variant_has(stage: str) -> None:
 @pytest.mark.parametrize(
     ("opening", "words"),
     [
-        (Opening(variants=("/World{size=huge}",)), ["--variant '/World{size=huge}'", "choose from", "small", "large"]),
-        (Opening(variants=("/World{shape=x}",)), ["--variant '/World{shape=x}'", "the sets size"]),
+        (
+            Opening(variants=("/World{size=huge}",)),
+            ["--variant '/World{size=huge}'", "no 'huge'; choose from", "small", "large"],
+        ),
+        (Opening(variants=("/World{shape=x}",)), ["--variant '/World{shape=x}'", "no set 'shape'", "the sets size"]),
+        (Opening(variants=("/World/Left{size=x}",)), ["--variant '/World/Left{size=x}'", "no set 'size'", "(none)"]),
         (Opening(variants=("/Nope{size=x}",)), ["--variant '/Nope{size=x}'", "no such prim", "/World{size=...}"]),
         (Opening(variants=("/World size=x",)), ["--variant '/World size=x'", "/Prim{set=name}"]),
         (Opening(variants=("/Wor ld{a=b}",)), ["--variant '/Wor ld{a=b}'", "/Prim{set=name}"]),
@@ -195,6 +199,12 @@ def test_what_is_not_there_is_one_sentence_with_flag_and_choice(opening: Opening
     assert said.startswith(words[0])
     assert all(word in said for word in words), said
     assert "\n" not in said
+
+
+def test_a_mask_of_commas_is_no_path(stage: str) -> None:
+    result = refract("inspect", stage, "--mask", " , ")
+    assert result.exit_code == 2
+    assert "--mask  , : is no prim path" in result.stderr
 
 
 def test_a_session_layer_that_is_no_layer_is_named(stage: str, tmp_path: Path) -> None:
@@ -247,3 +257,64 @@ def test_a_flat_conversion_holds_what_was_chosen(stage: str, session: str, tmp_p
     assert refract(*words).exit_code == 0
     assert radius(open_stage(out)) == 4.0
     assert "size" not in open_stage(out).GetPrimAtPath("/World").GetVariantSets().GetNames()
+
+
+IN_A_VARIANT = """#usda 1.0
+( defaultPrim = "W" )
+def Xform "W" (
+    prepend variantSets = "show"
+    variants = { string show = "nothing" }
+)
+{
+    variantSet "show" = {
+        "nothing" {
+        }
+        "ball" {
+            def Sphere "Ball" (prepend apiSchemas = ["MaterialBindingAPI"])
+            {
+                rel material:binding = </W/Glass>
+            }
+            def Material "Glass"
+            {
+                token outputs:surface.connect = </W/Glass/S.outputs:surface>
+                def Shader "S"
+                {
+                    uniform token info:id = "UsdPreviewSurface"
+                    float inputs:opacity = 0.1
+                    token outputs:surface
+                }
+            }
+        }
+    }
+}
+"""
+
+
+@pytest.mark.parametrize("flat", [(), ("--flatten",)], ids=["layer", "flat"])
+@pytest.mark.parametrize("more", [("--to", "openpbr"), ("--thickness", "measured")], ids="=".join)
+def test_a_conversion_writes_what_only_a_chosen_variant_has(
+    flat: tuple[str, ...], more: tuple[str, ...], tmp_path: Path
+) -> None:
+    """Whatever is written after the glass is found opens the stage once more, as it was opened before."""
+    (tmp_path / "in.usda").write_text(IN_A_VARIANT)
+    chosen = Opening(variants=("/W{show=ball}",))
+    result = refract(
+        "convert", tmp_path / "in.usda", tmp_path / "out.usda", "--variant", *chosen.variants, *flat, *more
+    )
+    assert result.exit_code == 0, result.stderr
+    made = open_stage(str(tmp_path / "out.usda"), AS_IT_IS if flat else chosen)
+    if "--to" in more:
+        glass = UsdShade.Material(made.GetPrimAtPath("/W/Glass"))
+        assert glass.ComputeSurfaceSource("mtlx")[0].GetShaderId() == "ND_open_pbr_surface_surfaceshader"
+    else:
+        assert made.GetPrimAtPath("/W/Ball").GetAttribute("primvars:refraction:thickness").HasAuthoredValue()
+
+
+@pytest.mark.parametrize("opening", [("--variant", "/W{a=b}"), ("--session-layer", "gone.usda"), ("--mask", "/W")])
+def test_a_gltf_file_is_no_stage_to_open_in_another_way(opening: tuple[str, str], tmp_path: Path) -> None:
+    (tmp_path / "in.gltf").write_text('{"asset": {"version": "2.0"}}')
+    result = refract("convert", tmp_path / "in.gltf", tmp_path / "out.usda", *opening)
+    assert result.exit_code == 2
+    assert opening[0] in result.stderr
+    assert "leave them out" in result.stderr
+    assert not (tmp_path / "out.usda").exists()

@@ -9,6 +9,7 @@ from scene_reading import read, texts, to_stage
 from refract_core.errors import StageError
 from refract_core.scene import Balls, Model, Scene
 from refract_core.usd.geometry import dots
+from refract_core.usd.geometry.place import NOTHING_LEFT
 
 THREE = 'def Points "P" {{ point3f[] points = [(0, 0, 0), (4, 0, 0), (0, 6, 0)] \n {extra} }}'
 
@@ -113,6 +114,15 @@ def test_stretched_points_are_ellipsoids() -> None:
     np.testing.assert_allclose([low[:2], high[:2]], [(-2, -2), (15, 16)], atol=1e-2)
 
 
+def test_points_that_a_transform_leaves_nothing_of_are_named() -> None:
+    proto = THREE.replace('"P"', '"Proto"').format(extra="")
+    scene = instanced(2, "(1, 1, 0)", proto)
+    assert not scene.balls
+    assert not scene.instances
+    assert texts(scene, "/I/[0]/Proto") == f"{NOTHING_LEFT} (2 prims: /I/[0]/Proto, /I/[1]/Proto)"
+    assert NOTHING_LEFT not in texts(instanced(2, "(1, 1, 2)", proto), "/I/[0]/Proto")
+
+
 def test_sphere_prototypes_in_many_places_are_exact() -> None:
     scene = instanced(100, "(2, 2, 2)", 'def Sphere "Proto" { double radius = 0.5 }')
     balls = only(scene)
@@ -121,6 +131,20 @@ def test_sphere_prototypes_in_many_places_are_exact() -> None:
     np.testing.assert_allclose(to_stage(scene, balls.centres[7]), (70, 0, 0), atol=1e-4)
     few = instanced(3, "(2, 2, 2)", 'def Sphere "Proto" { double radius = 0.5 }')
     assert len(few.spheres) == 3
+
+
+def test_native_instances_of_a_sphere_are_one_record() -> None:
+    places = "".join(
+        f"""def Xform "I{k}" (instanceable = true
+            references = </Proto>) {{ double3 xformOp:translate = ({k}, 0, 0)
+            uniform token[] xformOpOrder = ["xformOp:translate"] }}"""
+        for k in range(100)
+    )
+    scene = read(f'class Xform "Proto" {{ def Sphere "Ball" {{ double radius = 0.25 }} }} {places}')
+    balls = only(scene)
+    assert list(balls.paths) == [f"/I{k}/Ball" for k in range(100)]
+    np.testing.assert_allclose(to_stage(scene, balls.centres)[:, 0], np.arange(100), atol=1e-5)
+    np.testing.assert_allclose(balls.radii, 0.25)
 
 
 def test_too_many_points_are_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -96,14 +96,22 @@ def refract(folder: Path, *words: str) -> Result:
     return result
 
 
+def parts(path: Path) -> list[oiio.ImageBuf]:
+    """Every part of a file."""
+    count = oiio.ImageBuf(str(path)).nsubimages
+    return [oiio.ImageBuf(str(path), part, 0) for part in range(count)]
+
+
 def channels(path: Path) -> list[str]:
-    return list(oiio.ImageBuf(str(path)).spec().channelnames)
+    """Names of all channels, in the order of the alphabet."""
+    return sorted(name for part in parts(path) for name in part.spec().channelnames)
 
 
 def channel(path: Path, name: str) -> np.ndarray:
-    pixels = oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT)
+    (part,) = (one for one in parts(path) if name in one.spec().channelnames)
+    pixels = part.get_pixels(oiio.FLOAT)
     assert pixels is not None
-    return pixels[..., channels(path).index(name)]
+    return pixels[..., part.spec().channelnames.index(name)]
 
 
 # --- what is read ---------------------------------------------------------------------------------------------------
@@ -193,7 +201,7 @@ def test_flags_win_over_products(folder: Path) -> None:
     (folder / "s.usda").write_text(text(first))
     words = ("mine.exr", "--image-width", "8", "--image-height", "8", "--aovs", "beauty")
     assert refract(folder, *words).exit_code == 0
-    assert channels(folder / "mine.exr") == ["R", "G", "B", "A"]
+    assert channels(folder / "mine.exr") == ["A", "B", "G", "R"]
     assert read_planes(str(folder / "mine.exr"))["beauty"].shape == (8, 8, 4)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import subdivision_rules as rules
 from numpy.typing import NDArray
-from scene_reading import CUBE, areas, read, signed_volume, solid, stage_of, texts, to_stage
+from scene_reading import CUBE, WALL_SEEN, areas, read, signed_volume, solid, stage_of, texts, to_stage
 from scipy.interpolate import BSpline
 from scipy.spatial import cKDTree
 from subdivision_rules import Net
@@ -910,19 +910,6 @@ def test_points_of_high_valence_and_polygons_of_many_sides() -> None:
 def test_a_glass_cube_refracts_as_its_limit() -> None:
     """The picture of a cube that is subdivided is that of a fine mesh on the limit, with normals of its own making."""
     head = 'def DistantLight "L" { float inputs:intensity = 3 }\n'
-    wall = """def Mesh "Wall" {
-        uniform token subdivisionScheme = "none"
-        int[] faceVertexCounts = [4, 4, 4, 4]
-        int[] faceVertexIndices = [0, 1, 4, 3, 1, 2, 5, 4, 3, 4, 7, 6, 4, 5, 8, 7]
-        point3f[] points = [(-4, -4, -3), (0, -4, -3), (4, -4, -3), (-4, 0, -3), (0, 0, -3), (4, 0, -3), (-4, 4, -3),
-            (0, 4, -3), (4, 4, -3)]
-        color3f[] primvars:displayColor = [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0)] (interpolation = "uniform") }
-        def Camera "Cam" {
-            double3 xformOp:translate = (0.3, 0.2, 8)
-            uniform token[] xformOpOrder = ["xformOp:translate"]
-            float2 clippingRange = (0.1, 100)
-            float focalLength = 60 }
-        """
     bound = "rel material:binding = </Glass>"
     points, faces = solid("cube")
     net = rules.after(net_of(np.array(points, float), faces), 4)
@@ -936,7 +923,7 @@ def test_a_glass_cube_refracts_as_its_limit() -> None:
     by_hand = MESH(fine, net.faces, scheme="none", extra=f'{bound}\nnormal3f[] normals = [{listed}]')
     settings = rc.RenderSettings(image_width=48, image_height=48, samples=4, camera="/Cam")
     ours, expected, cage = (
-        rc.render(read(head + wall + GLASS + text, complexity="high"), settings).planes["beauty"][..., :3]
+        rc.render(read(head + WALL_SEEN + GLASS + text, complexity="high"), settings).planes["beauty"][..., :3]
         for text in (MESH(points, faces, extra=bound), by_hand, MESH(points, faces, scheme="none", extra=bound))
     )
     assert np.abs(ours - expected).mean() < 0.01 * expected.mean()

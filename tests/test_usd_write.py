@@ -141,10 +141,10 @@ def test_other_extensions_are_refused(stage: Path, name: str) -> None:
 
 
 def test_a_folder_that_is_not_there_is_named(stage: Path) -> None:
-    with pytest.raises(StageError, match="make it first"):
+    with pytest.raises(UsageError, match="make it first"):
         check_out(str(stage), str(stage.parent / "missing" / "a.usda"), overwrite=True)
     (stage.parent / "a.usda").mkdir()
-    with pytest.raises(StageError, match="is a folder"):
+    with pytest.raises(UsageError, match="is a folder"):
         check_out(str(stage), str(stage.parent / "a.usda"), overwrite=True)
 
 

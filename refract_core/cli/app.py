@@ -16,6 +16,7 @@ from ..errors import RefractError, UsageError
 from ..progress import Report, reporting
 from ..settings import Opening, RenderSettings
 from ..version import __version__
+from .shell import Commands
 
 CANCELLED = 3
 
@@ -27,12 +28,10 @@ def _in_kebab(name: str) -> str:
     return _HUMP.sub(lambda found: f"-{found[0].lower()}", name)
 
 
-app = typer.Typer(
-    help="Render USD stages with glass in them, without a GPU or a display.",
+app = Commands(
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
-    context_settings={"token_normalize_func": _in_kebab},
+    context_settings={"token_normalize_func": _in_kebab, "help_option_names": ["-h", "--help"]},
     rich_markup_mode=None,  # the boxes cut long option names off
 )
 
@@ -54,9 +53,14 @@ ProgressMode = Annotated[
     str,
     typer.Option(
         "--progress",
-        metavar="auto|json|none",
-        help="How progress is told on stderr: auto is a bar on a terminal, json is one object per line.",
+        metavar="auto|lines|json|none",
+        help="What is told on stderr: auto is a bar on a terminal, and everywhere a line for each file; lines has a "
+        "line for each percent, too, such as 42%; json is one object per line; none has warnings and errors alone.",
     ),
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
+Verbose = Annotated[
+    bool, typer.Option("--verbose", "-v", help="Say how many seconds each part of the work has taken, too.")
 ]
 
 
@@ -87,8 +91,9 @@ Mask = Annotated[
 
 
 def opening_of(variant: list[str] | None, session_layer: str, mask: str) -> Opening:
-    """What the three options say."""
-    return Opening(variants=tuple(variant or ()), session_layer=session_layer, mask=words(mask))
+    """What the three options say; a mask of commas alone is refused like any other word that is no path."""
+    named = words(mask) or ((mask,) if mask else ())
+    return Opening(variants=tuple(variant or ()), session_layer=session_layer, mask=named)
 
 
 def only_option(what: str) -> Any:
@@ -97,9 +102,30 @@ def only_option(what: str) -> Any:
     return typer.Option(metavar="PATH,...", help=help_text)
 
 
+def stages_argument(what: str) -> Any:
+    """STAGE of the commands that take several (`verbs.validate_many.stages_named`)."""
+    help_text = f"The .usd, .usda, .usdc or .usdz files to {what}. A folder means every such file below it."
+    return typer.Argument(metavar="STAGE", help=help_text)
+
+
+AsJson = Annotated[bool, typer.Option("--json", help="The same as --format json.")]
+
+
+def format_of(form: str, json: bool, known: tuple[str, ...]) -> str:
+    """What --format and --json ask for together. Raises UsageError."""
+    if form not in known:
+        raise UsageError(f"--format is '{form}', not known; choose from {', '.join(known)}")
+    if json and form not in ("text", "json"):
+        raise UsageError(f"--json is --format json, and --format {form} is given too; leave one of them out")
+    return "json" if json else form
+
+
 @app.callback()
 def refract(version: Version = False) -> None:
     """Render USD stages with glass in them, without a GPU or a display.
+
+    Every option has a default in the environment: REFRACT_RENDER_IMAGE_WIDTH=1920 is --image-width of render,
+    REFRACT_BAKE_PROBES_JOBS=4 is --jobs of bake probes. The word @FILE stands for the words in a file.
 
     Exit codes: 0 done, 1 failed, 2 wrong usage, 3 cancelled.
     """
@@ -111,12 +137,16 @@ def words(text: str) -> tuple[str, ...]:
 
 
 @contextmanager
-def outcome(progress: str) -> Iterator[tuple[Report, Callable[[], bool]]]:
+def outcome(
+    progress: str, quiet: bool = False, verbose: bool = False
+) -> Iterator[tuple[Report, Callable[[], bool]]]:
     """Turn errors into a line on stderr and the exit code, and Ctrl-C into a wish to stop."""
     try:
-        with reporting(progress) as report, _interrupts() as cancel:
+        with reporting(progress, quiet=quiet, verbose=verbose) as report, _interrupts() as cancel:
             try:
                 yield report, cancel
+                if seconds := report.parts():
+                    report.closing(seconds)
             except RefractError as error:
                 report.error(_by_flag(error))
                 raise typer.Exit(error.exit_code) from error

@@ -11,17 +11,20 @@ from .app import (
     Jobs,
     Mask,
     ProgressMode,
+    Quiet,
     SessionLayer,
     StagePath,
     Variant,
+    Verbose,
     app,
     only_option,
     opening_of,
     outcome,
     words,
 )
+from .shell import Commands
 
-bake = typer.Typer(help="Work something out once and keep it in a layer over the stage.", no_args_is_help=True)
+bake = Commands(help="Work something out once and keep it in a layer over the stage.", no_args_is_help=True)
 app.add_typer(bake, name="bake", rich_help_panel=None)
 
 Overwrite = Annotated[
@@ -77,6 +80,8 @@ def bake_probes_command(
     jobs: Jobs = None,
     executor: Executor = "",
     progress: ProgressMode = "auto",
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Bake reflection probes to EXR cubemaps, and write a layer over STAGE that uses them.
 
@@ -99,7 +104,7 @@ def bake_probes_command(
         overwrite=overwrite,
         opening=opening_of(variant, session_layer, mask),
     )
-    with outcome(progress) as (report, cancel), crew_at(executor) as crew:
+    with outcome(progress, quiet, verbose) as (report, cancel), crew_at(executor) as crew:
         bake_probes(order, report, cancel, crew=crew)
 
 
@@ -144,6 +149,8 @@ def bake_thickness_command(
     mask: Mask = "",
     jobs: Jobs = None,
     progress: ProgressMode = "auto",
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Measure how thick glass is in its own geometry, and write a layer over STAGE that says so.
 
@@ -153,7 +160,7 @@ def bake_thickness_command(
     """
     from ..verbs.bake_thickness import ThicknessOrder, bake_thickness
 
-    with outcome(progress) as (report, cancel):
+    with outcome(progress, quiet, verbose) as (report, cancel):
         order = ThicknessOrder(
             stage=stage, out=out, only=words(only), along=along, texture=texture, jobs=jobs or 0, overwrite=overwrite,
             opening=opening_of(variant, session_layer, mask),

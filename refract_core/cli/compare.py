@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..errors import UsageError
-from .app import Jobs, Mask, ProgressMode, SessionLayer, Variant, app, opening_of, outcome, words
+from .app import Jobs, Mask, ProgressMode, Quiet, SessionLayer, Variant, Verbose, app, opening_of, outcome, words
 from .render import (
     Camera,
     DisableCameraLight,
@@ -67,6 +67,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print report.json instead of
 
 @app.command("compare")
 def compare_command(
+    ctx: typer.Context,
     first: First,
     second: Second,
     third: Third = "",
@@ -92,6 +93,8 @@ def compare_command(
     jobs: Jobs = None,
     as_json: Json = False,
     progress: ProgressMode = "auto",
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Measure a picture against the truth: PSNR, SSIM and FLIP of all, of the glass, of each prim and each tier.
 
@@ -115,7 +118,7 @@ def compare_command(
     }
     given = {name: value for name, value in drawing.items() if value is not None}
     how = {"fail_under": fail_under, "overwrite": overwrite}
-    with outcome(progress) as (report, cancel):
+    with outcome(progress, quiet, verbose) as (report, cancel):
         if _is_stage(first):
             if third:
                 raise UsageError(f"{third}: is one word too many; a stage takes one folder, as in STAGE OUTDIR")
@@ -133,7 +136,7 @@ def compare_command(
                 "--variant": variant, "--session-layer": session_layer, "--mask": mask,
             }  # fmt: skip
             named = [f"--{name.replace('_', '-')}" for name in given if name not in ("camera_light", "jobs")]
-            _refuse(first, [*named, *(flag for flag, is_given in flags.items() if is_given)])
+            _refuse(first, [flag for flag in (*named, *filter(flags.get, flags)) if _typed(ctx, flag)])
             account = _of_pictures(first, second, third, how)
             out = third
         typer.echo(to_json(account) if as_json else to_text(account, out))
@@ -145,6 +148,12 @@ def compare_command(
 def _is_stage(path: str) -> bool:
     """By its name; a package may name a layer inside, as in `a.usdz[b.usda]`."""
     return os.path.splitext(path.partition("[")[0])[1].lower() in STAGES
+
+
+def _typed(ctx: typer.Context, flag: str) -> bool:
+    """It was asked for here and now; a default in the environment is for those comparisons that can use it."""
+    source = ctx.get_parameter_source(flag.lstrip("-").replace("-", "_"))
+    return source is not None and source.name == "COMMANDLINE"
 
 
 def _refuse(picture: str, flags: list[str]) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..models import MODELS
-from .app import Mask, ProgressMode, SessionLayer, Variant, app, only_option, opening_of, outcome, words
+from .app import Mask, ProgressMode, Quiet, SessionLayer, Variant, Verbose, app, only_option, opening_of, outcome, words
 
 if TYPE_CHECKING:
     from ..verbs.convert import Converted, ConvertOrder, Row
@@ -72,6 +72,8 @@ def convert_command(
     mask: Mask = "",
     as_json: Json = False,
     progress: ProgressMode = "auto",
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Find the glass of a stage and describe it with RefractMaterialAPI.
 
@@ -81,7 +83,7 @@ def convert_command(
     """
     from ..verbs.convert import ConvertOrder, convert
 
-    with outcome(progress) as (report, cancel):
+    with outcome(progress, quiet, verbose) as (report, cancel):
         order = ConvertOrder(
             stage=stage, out=out, flatten=flatten, model=model, only=words(only), thickness=thickness, to=to,
             overwrite=overwrite, opening=opening_of(variant, session_layer, mask),
@@ -89,7 +91,8 @@ def convert_command(
         found = convert(order, report.progress, cancel)
         for notice in found.notices:
             report.warning(notice.path, notice.text)
-    typer.echo(_as_json(order, found) if as_json else _as_table(order, found.rows))
+    if as_json or not quiet:
+        typer.echo(_as_json(order, found) if as_json else _as_table(order, found.rows))
 
 
 def _as_json(order: ConvertOrder, found: Converted) -> str:

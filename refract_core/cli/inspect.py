@@ -2,35 +2,27 @@
 
 from __future__ import annotations
 
-import os
 from typing import Annotated
 
 import typer
 
-from ..errors import RefractError, UsageError
-from .app import Mask, SessionLayer, Variant, app, opening_of, outcome
+from ..errors import RefractError
+from .app import AsJson, Mask, SessionLayer, Variant, app, format_of, opening_of, outcome, stages_argument
 
-Stages = Annotated[
-    list[str],
-    typer.Argument(
-        metavar="STAGE",
-        help="The .usd, .usda, .usdc or .usdz files to look at. A folder means every such file below it.",
-    ),
-]
+Stages = Annotated[list[str], stages_argument("look at")]
 Form = Annotated[
     str,
     typer.Option(
         "--format", metavar="text|json", help="json has everything; the text is cut to one screen for each stage."
     ),
 ]
-Json = Annotated[bool, typer.Option("--json", help="The same as --format json.")]
 
 
 @app.command()
 def inspect(
     stages: Stages,
     form: Form = "text",
-    json: Json = False,
+    json: AsJson = False,
     variant: Variant = None,
     session_layer: SessionLayer = "",
     mask: Mask = "",
@@ -41,17 +33,15 @@ def inspect(
     that cannot be read is told on stderr, and makes the exit code 1 in the end; JSON is then an array.
     """
     from ..verbs import inspect as room
-    from ..verbs.validate_many import stages_named
+    from ..verbs.validate_many import names_one, stages_named
 
     opening = opening_of(variant, session_layer, mask)
     reports: list[room.Report] = []
     failed = False
     with outcome("none") as (report, cancel):
-        if form not in ("text", "json"):
-            raise UsageError(f"--format is '{form}', not known; choose from text, json")
-        as_json = json or form == "json"
+        as_json = format_of(form, json, ("text", "json")) == "json"
         named = stages_named(stages)
-        alone = len(stages) == 1 and not os.path.isdir(stages[0])
+        alone = names_one(stages)
         for stage in named:
             try:
                 reports.append(room.inspect(stage, cancel, opening))

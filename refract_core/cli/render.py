@@ -7,12 +7,16 @@ from typing import Annotated, Any
 import typer
 
 from ..errors import UsageError
+from ..images.exr import COMPRESSIONS, PARTS, USUAL, Layout
 from ..models import MODELS, explained
-from ..settings import PRESETS, QUALITIES
+from ..settings import PRESETS, QUALITIES, STUDIOS
 from ..verbs.executors import crew_at
 from ..verbs.override import COLORS, RANGES
 from ..verbs.render_files import Order, render_files
-from .app import Jobs, Mask, ProgressMode, SessionLayer, Variant, app, opening_of, outcome, words
+from .app import Jobs, Mask, ProgressMode, Quiet, SessionLayer, Variant, Verbose, app, opening_of, outcome, words
+from .looks import shown_on_signal
+from .orbit import Azimuth, Distance, Elevation, Fit, FocalLength, Fov, LookAt, orbit_of
+from .stdout import written_to
 
 Stage = Annotated[
     str, typer.Argument(metavar="STAGE", help="The .usd, .usda, .usdc or .usdz file to render, or a .mtlx file.")
@@ -24,12 +28,16 @@ Out = Annotated[
         show_default=False,
         help="The picture to write: .exr holds all AOVs, .png, .jpg, .webp and .tif hold one. With several --frames "
         "the file name has one ### group, such as shot.###.png, or shot.###.##.png for fractions of a frame. Without "
-        "OUT, the RenderProducts of the stage's RenderSettings are written, each under its productName.",
+        "OUT, the RenderProducts of the stage's RenderSettings are written, each under its productName. With {aov} in "
+        "the file name, as in shot.{aov}.png, each of --aovs has a file of its own. - is one picture on stdout.",
     ),
 ]
 Camera = Annotated[
-    str | None,
-    typer.Option(help="Prim path or name of the camera. Without it the stage's choice is taken, as usdrecord does."),
+    list[str] | None,
+    typer.Option(
+        help="Prim path or name of the camera. Without it the stage's choice is taken, as usdrecord does. May be "
+        "repeated, for one picture each: OUT then has {camera} where its name goes, such as shot.{camera}.png."
+    ),
 ]
 Frames = Annotated[
     str,
@@ -44,6 +52,27 @@ ImageWidth = Annotated[
     int | None, typer.Option("--image-width", "-w", help="Width in pixels. The default is 960.", show_default=False)
 ]
 ImageHeight = Annotated[int | None, typer.Option(help="Height in pixels. Without it the camera's aspect decides.")]
+Crop = Annotated[
+    str,
+    typer.Option(
+        metavar="X0,Y0,X1,Y1",
+        help="Draw this part of the picture alone, from the upper left: shares of its sides where none is above 1, "
+        "else pixels. Its pixels are those of the whole picture; an .exr has it as data window in the display window.",
+        show_default=False,
+    ),
+]
+TileCount = Annotated[
+    tuple[int, int] | None,
+    typer.Option(
+        metavar="COLUMNS ROWS",
+        help="Cut the picture into so many parts, and draw one of them; `refract join` makes them one picture again.",
+        show_default=False,
+    ),
+]
+TileIndex = Annotated[
+    int | None,
+    typer.Option(help="Which of them: row by row, from 0 on the upper left.", show_default=False),
+]
 Samples = Annotated[
     int | None,
     typer.Option(
@@ -143,7 +172,15 @@ MaxLayers = Annotated[
 Aovs = Annotated[
     str,
     typer.Option(
-        metavar="LIST", help="AOVs to write, with commas between. Without it .exr gets all, other formats the picture."
+        metavar="LIST",
+        help="AOVs to write, with commas between. Without it .exr gets all but albedo and denoising_normal, which are "
+        "drawn only where they are named; other formats get the picture.",
+    ),
+]
+PipeFormat = Annotated[
+    str,
+    typer.Option(
+        "--format", metavar="png|exr|jpg|tif|webp|avif", help="What a picture on stdout (OUT -) is. The default is png."
     ),
 ]
 Purposes = Annotated[
@@ -169,12 +206,20 @@ ColorCorrection = Annotated[
         help="What colours go through on their way into an 8-bit file. An .exr always holds linear light.",
     ),
 ]
+Denoise = Annotated[
+    bool,
+    typer.Option(
+        "--denoise",
+        help="Take the noise out of the picture with Open Image Denoise, which the extra denoise brings. It is told "
+        "albedo and normal of what is seen, also through glass. All other AOVs stay as they are drawn.",
+    ),
+]
 Exposure = Annotated[float | None, typer.Option(help="Stops of light added to the camera's own exposure.")]
 DisableCameraLight = Annotated[
     bool,
     typer.Option(
         "--disable-camera-light",
-        help="Add no light where the stage has none. Without it one shines from the camera if nothing else shines.",
+        help="Add no light where the stage has none: no studio by itself, and none from the camera.",
     ),
 ]
 DisableEmissionLight = Annotated[
@@ -182,6 +227,29 @@ DisableEmissionLight = Annotated[
     typer.Option(
         "--disable-emission-light",
         help="Let what glows be seen, but light nothing else, as real-time engines have it.",
+    ),
+]
+Studio = Annotated[
+    str | None,
+    typer.Option(
+        metavar="|".join(STUDIOS),
+        help="Put lamps, a dome and a floor around what is drawn, whatever light the stage has. Without it softbox is "
+        "used where a thing has no light at all; none leaves it out.",
+    ),
+]
+Environment = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE", help="A latlong .hdr or .exr picture that lights the stage in place of its domes. It excludes "
+        "--studio."
+    ),
+]
+Background = Annotated[
+    str | None,
+    typer.Option(
+        metavar="transparent|#rrggbb|environment",
+        help="What is seen past everything, and through glass: nothing, which is left open in the picture's alpha, one "
+        "colour, or the dome and a studio's floor. Light and reflections stay as they are. The default is environment.",
     ),
 ]
 SettingsPrim = Annotated[
@@ -201,10 +269,56 @@ Executor = Annotated[
     ),
 ]
 SkipExisting = Annotated[bool, typer.Option("--skip-existing", help="Leave pictures that exist as they are.")]
+Cryptomatte = Annotated[
+    str | None,
+    typer.Option(
+        metavar="LIST",
+        help="Mattes to write into an .exr, out of object and material: whose each part of a pixel is, by the first "
+        "surface seen (Cryptomatte 1.2).",
+    ),
+]
+ExrCompression = Annotated[
+    str,
+    typer.Option(
+        metavar="|".join(COMPRESSIONS),
+        help="How an .exr is compressed: zips is what compositing reads fastest; dwaa is small and loses what no eye "
+        "sees, of colours alone.",
+    ),
+]
+ExrParts = Annotated[
+    str,
+    typer.Option(
+        metavar="|".join(PARTS),
+        help="many writes each AOV as a part of its own, the picture first; one writes all channels into one part, for "
+        "programs that know nothing else.",
+    ),
+]
 Strict = Annotated[
     bool,
     typer.Option(
-        "--strict", help="Fail where a picture shows nothing of the stage. It is written, and the rest is rendered."
+        "--strict",
+        help="Fail where a picture shows nothing of the stage, or was stopped by --time-limit. It is written, and the "
+        "rest is rendered.",
+    ),
+]
+TimeLimit = Annotated[
+    float,
+    typer.Option(
+        metavar="SECONDS",
+        help="Stop a picture after this time, and write what it is then: every pixel is drawn with one sample first, "
+        "so that it is whole. A warning says how much is as asked. If not even that was done in time, nothing is "
+        "written and the exit code is 1.",
+        show_default=False,
+    ),
+]
+SnapshotEvery = Annotated[
+    float,
+    typer.Option(
+        "--snapshot",
+        metavar="SECONDS",
+        help="Write what is finished so far this often, as OUT with _part before its extension, and whenever the "
+        "process gets SIGUSR1. It goes when the picture is there.",
+        show_default=False,
     ),
 ]
 
@@ -214,9 +328,19 @@ def render(
     stage: Stage,
     out: Out = "",
     camera: Camera = None,
+    azimuth: Azimuth = None,
+    elevation: Elevation = None,
+    distance: Distance = None,
+    fit: Fit = None,
+    fov: Fov = None,
+    focal_length: FocalLength = None,
+    look_at: LookAt = "",
     frames: Frames = "",
     image_width: ImageWidth = None,
     image_height: ImageHeight = None,
+    crop: Crop = "",
+    tile_count: TileCount = None,
+    tile_index: TileIndex = None,
     quality: Quality = None,
     preset: Preset = None,
     samples: Samples = None,
@@ -231,12 +355,20 @@ def render(
     override: Override = None,
     max_layers: MaxLayers = None,
     aovs: Aovs = "",
+    form: PipeFormat = "",
     purposes: Purposes = None,
     complexity: Complexity = "low",
     color_correction_mode: ColorCorrection = "sRGB",
+    denoise: Denoise = False,
+    cryptomatte: Cryptomatte = None,
+    exr_compression: ExrCompression = USUAL.compression,
+    exr_parts: ExrParts = USUAL.parts,
     exposure: Exposure = None,
     disable_camera_light: DisableCameraLight = False,
     disable_emission_light: DisableEmissionLight = False,
+    studio: Studio = None,
+    environment: Environment = None,
+    background: Background = None,
     render_settings_prim_path: SettingsPrim = "",
     variant: Variant = None,
     session_layer: SessionLayer = "",
@@ -246,51 +378,81 @@ def render(
     tile_size: TileSize = None,
     skip_existing: SkipExisting = False,
     strict: Strict = False,
+    time_limit: TimeLimit = 0.0,
+    snapshot: SnapshotEvery = 0.0,
     progress: ProgressMode = "auto",
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Render a stage to a picture, or to one picture per frame."""
-    with outcome(progress) as (report, cancel), crew_at(executor) as crew:
+    with (
+        outcome(progress, quiet, verbose) as (report, cancel),
+        written_to(out, form, frames, words(aovs), report) as (file, report),
+        crew_at(executor) as crew,
+        shown_on_signal() as asked,
+    ):
         given = {
-            "camera": camera,
+            **orbit_of(azimuth, elevation, distance, fit, fov, focal_length, look_at),
             "image_width": image_width,
             "image_height": image_height,
+            **part_of(crop, tile_count, tile_index),
             "quality": quality,
             "preset": preset,
             "samples": samples,
             "tolerance": tolerance,
             "light_samples": light_samples,
-            "caustics": None if caustics is None else _photons(caustics, quality or ""),
+            "caustics": None if caustics is None else photons_of(caustics, quality or ""),
             "indirect": indirect,
             "cut": cut,
             "tiers": None if tiers is None else words(tiers),
             "screen": screen,
             "model": model,
             "max_layers": max_layers,
-            "purposes": None if purposes is None else _purposes(purposes),
+            "purposes": None if purposes is None else purposes_of(purposes),
+            "denoise": denoise or None,
+            "cryptomatte": None if cryptomatte is None else words(cryptomatte),
             "exposure": exposure,
             "camera_light": False if disable_camera_light else None,
             "emission_light": False if disable_emission_light else None,
+            "studio": studio,
+            "environment": environment,
+            "background": background,
             "jobs": jobs,
             "tile_size": tile_size,
         }
         order = Order(
             stage=stage,
-            out=out,
+            out=file,
+            cameras=tuple(camera or ()),
             frames=frames,
             overrides={name: value for name, value in given.items() if value is not None},
-            materials=_materials(override or []),
+            materials=materials_of(override or []),
             settings_prim=render_settings_prim_path,
             aovs=words(aovs),
             color_correction=color_correction_mode,
             complexity=complexity,
             skip_existing=skip_existing,
             strict=strict,
+            time_limit=time_limit,
+            snapshot=snapshot,
             opening=opening_of(variant, session_layer, mask),
+            layout=Layout(exr_compression, exr_parts),
         )
-        render_files(order, report, cancel, crew)
+        render_files(order, report, cancel, crew, asked)
 
 
-def _photons(text: str, quality: str) -> int:
+def part_of(crop: str, count: tuple[int, int] | None, index: int | None) -> dict[str, Any]:
+    """Which part of the picture is drawn. Raises UsageError."""
+    if (count is None) != (index is None):
+        raise UsageError("--tile-count and --tile-index go together: into how many parts, and which of them")
+    try:
+        part = tuple(float(word) for word in crop.split(",")) if crop else None
+    except ValueError:
+        raise UsageError(f"--crop is '{crop}'; it must be four numbers, x0,y0,x1,y1") from None
+    return {"crop": part, "tile_count": count, "tile_index": index}
+
+
+def photons_of(text: str, quality: str) -> int:
     """`on` is what the quality has, or good where that has none. Raises UsageError."""
     if text in ("on", "off"):
         usual = QUALITIES["good"]["caustics"]
@@ -301,12 +463,12 @@ def _photons(text: str, quality: str) -> int:
         raise UsageError(f"--caustics is '{text}'; it must be on, off, or a number of photons") from None
 
 
-def _purposes(text: str) -> tuple[str, ...]:
+def purposes_of(text: str) -> tuple[str, ...]:
     """usdrecord's rule: default is always drawn."""
     return ("default", *(word for word in words(text) if word != "default"))
 
 
-def _materials(given: list[str]) -> dict[str, dict[str, Any]]:
+def materials_of(given: list[str]) -> dict[str, dict[str, Any]]:
     """`PATH.FIELD=VALUE` words by path and field; of two about the same, the last counts."""
     found: dict[str, dict[str, Any]] = {}
     for word in given:

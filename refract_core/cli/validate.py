@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-import os
 from typing import Annotated
 
 import typer
 
 from ..errors import UsageError
-from .app import Mask, SessionLayer, Variant, app, opening_of, outcome
+from .app import AsJson, Mask, SessionLayer, Variant, app, format_of, opening_of, outcome, stages_argument
 
-Stages = Annotated[
-    list[str],
-    typer.Argument(
-        metavar="STAGE",
-        help="The .usd, .usda, .usdc or .usdz files to check. A folder means every such file below it.",
-    ),
-]
+Stages = Annotated[list[str], stages_argument("check")]
 Fix = Annotated[
     str,
     typer.Option(
@@ -35,7 +28,6 @@ Form = Annotated[
         help="json has every finding with rule, severity, path, text, fix; junit and sarif (2.1.0) are for CI systems.",
     ),
 ]
-Json = Annotated[bool, typer.Option("--json", help="The same as --format json.")]
 
 
 @app.command()
@@ -45,7 +37,7 @@ def validate(
     overwrite: Overwrite = False,
     strict: Strict = False,
     form: Form = "text",
-    json: Json = False,
+    json: AsJson = False,
     variant: Variant = None,
     session_layer: SessionLayer = "",
     mask: Mask = "",
@@ -64,9 +56,9 @@ def validate(
     opening = opening_of(variant, session_layer, mask)
     verdicts: list[room.Verdict] = []
     with outcome("none") as (_report, cancel):
-        shape = _shape(form, json, forms.FORMATS)
+        shape = format_of(form, json, forms.FORMATS)
         named = many.stages_named(stages)
-        alone = len(stages) == 1 and not os.path.isdir(stages[0])
+        alone = many.names_one(stages)
         if fix and not alone:
             raise UsageError("--fix writes one layer over one stage; name one file")
         if alone and (fix or shape in ("text", "json")):
@@ -85,12 +77,3 @@ def validate(
         typer.echo(forms.to_junit(verdicts, strict=strict) if shape == "junit" else forms.to_sarif(verdicts))
     if any(forms.fails(finding, strict=strict) for verdict in verdicts for finding in verdict.findings):
         raise typer.Exit(1)
-
-
-def _shape(form: str, json: bool, known: tuple[str, ...]) -> str:
-    """The form that was asked for. Raises UsageError."""
-    if form not in known:
-        raise UsageError(f"--format is '{form}', not known; choose from {', '.join(known)}")
-    if json and form not in ("text", "json"):
-        raise UsageError(f"--json is --format json, and --format {form} is given too; leave one of them out")
-    return "json" if json else form

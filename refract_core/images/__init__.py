@@ -2,4 +2,7 @@
 but its records.
 """
 
-__all__ = ["aovs", "codec", "cubemaps", "frame", "layouts", "pictures", "spaces", "srgb"]
+__all__ = [
+    "animation", "aovs", "codec", "cryptomatte", "cubemaps", "denoise", "exr", "frame", "joining", "layouts",
+    "pictures", "shown", "spaces", "srgb",
+]  # fmt: skip

@@ -24,8 +24,10 @@ AOVS: dict[str, Aov] = {
     "refraction": Aov(("refraction.R", "refraction.G", "refraction.B"), color=True),
     "reflection": Aov(("reflection.R", "reflection.G", "reflection.B"), color=True),
     "transmittance": Aov(("transmittance.R", "transmittance.G", "transmittance.B"), color=True),
+    "albedo": Aov(("albedo.R", "albedo.G", "albedo.B"), color=True),
     "N": Aov(("N.X", "N.Y", "N.Z")),
     "P": Aov(("P.X", "P.Y", "P.Z")),
+    "denoising_normal": Aov(("denoising_normal.X", "denoising_normal.Y", "denoising_normal.Z")),
 } | {
     name: Aov((name,), scalar=True)
     for name in (
@@ -42,6 +44,9 @@ AOVS: dict[str, Aov] = {
         "confidence",
     )
 }
+
+FEATURES = ("albedo", "denoising_normal")
+"""Planes that a frame has only where somebody asks for them: what a denoiser reads beside the picture."""
 
 
 def shape_of(name: str, height: int, width: int) -> tuple[int, ...]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import os
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -123,6 +123,45 @@ def read_channels(path: str, name: str) -> Channels:
         file.close()
 
 
+def read_parts(path: str, name: str, wanted: Collection[str]) -> dict[str, NDArray[np.float32]]:
+    """Channels of all parts of an .exr file, by name; of two that are called the same, the first.
+
+    Args:
+        wanted: names of the channels that are read; parts without any of them are passed over, and those that have
+            another size than the first.
+
+    Returns:
+        Name -> shape (H, W) float32: the display window.
+
+    Raises:
+        ImageError: unreadable, damaged or too large.
+    """
+    import OpenImageIO as oiio
+
+    found: dict[str, NDArray[np.float32]] = {}
+    file = oiio.ImageInput.open(path)
+    if file is None:
+        raise ImageError(f"{name}: not a readable image: {reason(oiio.geterror(), path)}")
+    try:
+        size, part = (0, 0), 0
+        while file.seek_subimage(part, 0):
+            spec = file.spec()
+            check_size(spec, name)
+            size = size if part else (spec.full_width, spec.full_height)
+            mine = [k for k, one in enumerate(spec.channelnames) if one in wanted and one not in found]
+            if mine and (spec.full_width, spec.full_height) == size:
+                first, last = mine[0], mine[-1] + 1
+                pixels = file.read_image(part, 0, first, last, oiio.FLOAT)
+                if pixels is None:
+                    raise ImageError(f"{name}: damaged image: {reason(file.geterror(), path)}")
+                shown = _display_window(pixels.reshape(spec.height, spec.width, last - first), spec)
+                found |= {spec.channelnames[k]: shown[..., k - first] for k in mine}
+            part += 1
+        return found
+    finally:
+        file.close()
+
+
 def read_size(path: str, name: str) -> tuple[int, int, bool]:
     """Width and height of the display window of a file's first image, and whether it has 8 bits.
 
@@ -164,7 +203,7 @@ def _display_window(pixels: NDArray[Any], spec: Any) -> NDArray[Any]:
     """Pixels of the display window; what the data window lacks is 0 (OpenEXR, "Technical Introduction")."""
     if (spec.x, spec.y, spec.width, spec.height) == (spec.full_x, spec.full_y, spec.full_width, spec.full_height):
         return pixels
-    shown = np.zeros((spec.full_height, spec.full_width, spec.nchannels), pixels.dtype)
+    shown = np.zeros((spec.full_height, spec.full_width, pixels.shape[2]), pixels.dtype)
     x, y = spec.x - spec.full_x, spec.y - spec.full_y
     left, right = max(x, 0), min(x + spec.width, spec.full_width)
     top, bottom = max(y, 0), min(y + spec.height, spec.full_height)
@@ -198,7 +237,12 @@ def _rgba(pixels: NDArray[Any], spec: Any) -> NDArray[Any]:
 
 
 def exr_spec(
-    width: int, height: int, channels: Sequence[str], formats: Sequence[str], metadata: Mapping[str, str | float]
+    width: int,
+    height: int,
+    channels: Sequence[str],
+    formats: Sequence[str],
+    metadata: Mapping[str, str | float],
+    compression: str = "zip",
 ) -> Any:
     """OpenImageIO's description of an EXR file whose bytes depend on nothing but what is written.
 
@@ -206,14 +250,16 @@ def exr_spec(
         channels: names, in the order of the pixels' last axis.
         formats: `half` or `float` for each channel.
         metadata: attributes of the file.
+        compression: OpenEXR's name of it.
     """
     import OpenImageIO as oiio
 
-    spec = oiio.ImageSpec(width, height, len(channels), formats[0] if len(formats) == 1 else "float")
+    alike = len(set(formats)) == 1  # then pixels that have this type go into the file as they are
+    spec = oiio.ImageSpec(width, height, len(channels), formats[0] if alike else "float")
     spec.channelnames = tuple(channels)
-    if len(formats) > 1:  # of a single channel OpenImageIO passes them over
+    if not alike:
         spec.channelformats = tuple(oiio.TypeDesc(one) for one in formats)
-    spec.attribute("compression", "zip")
+    spec.attribute("compression", compression)
     spec.attribute("DateTime", "")  # else the writer stamps the time, and equal pictures make unequal files
     for key, value in metadata.items():
         spec.attribute(key, value)
@@ -229,14 +275,21 @@ def encoded(path: str, pixels: NDArray[Any], spec: Any) -> bytes:
     """
     if extension_of(path) == ".avif":
         return _avif(path, pixels)
+    return encoded_parts(path, [(pixels, spec)])
+
+
+def encoded_parts(path: str, parts: Sequence[tuple[NDArray[Any], Any]]) -> bytes:
+    """The whole file in memory, part by part: pixels, and OpenImageIO's description of them. Only an .exr has many."""
     import OpenImageIO as oiio
 
     with memory_file() as name:
         file = oiio.ImageOutput.create(extension_of(path)[1:])
         if file is None:
             raise ImageError(f"{path}: cannot be encoded: {reason(oiio.geterror())}")
-        opened = file.open(name, spec)
-        written = opened and file.write_image(pixels)
+        specs = tuple(spec for _, spec in parts)
+        written = opened = file.open(name, specs if len(specs) > 1 else specs[0])
+        for k, (pixels, spec) in enumerate(parts):
+            written = written and (k == 0 or file.open(name, spec, "AppendSubimage")) and file.write_image(pixels)
         closed = opened and file.close()
         if not (written and closed):
             raise ImageError(f"{path}: cannot be encoded: {reason(file.geterror(), name)}")

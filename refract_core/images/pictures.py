@@ -11,23 +11,28 @@ from numpy.typing import NDArray
 from ..errors import ImageError, UsageError
 from ..files import check_place, write_whole
 from ..scene import F32, Texture
-from .aovs import AOVS, channels_of, check_names, shape_of
+from .aovs import AOVS, check_names, shape_of
 from .codec import (
     HALF_MAX,
     STRAIGHT_ALPHA,
     encoded,
+    encoded_parts,
     exr_spec,
     extension_of,
     named_file,
-    read_channels,
+    read_parts,
     read_pixels,
     read_size,
     reason,
 )
+from .cryptomatte import Matte
+from .exr import USUAL, Attribute, Layout, check_layout, parts_of
 from .spaces import AUTO, NAMES, RAW, SRGB, picture
-from .srgb import srgb_decode, srgb_encode
+from .srgb import as_floats, srgb_decode, srgb_encode
 
 COLOR_CORRECTIONS = ("disabled", "sRGB", "openColorIO")
+PLACE = "refract:place"
+"""Attribute of a part: column and row of its first pixel, width and height of the whole picture."""
 LAYERED = (".exr",)
 EIGHT_BIT = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".avif")
 _PNG_LEVEL, _PNG_SUB = 4, 0x10
@@ -96,23 +101,22 @@ def read_planes(path: str) -> dict[str, F32]:
         if extension not in LAYERED:
             rgba, _, integer, straight = read_pixels(file, path)
             return {"beauty": _linear_premultiplied(rgba, integer, straight)}
-        pixels, spec = read_channels(file, path)
-    at = {name: column for column, name in enumerate(spec.channelnames)}
-    lacking = [name for name in "RGB" if name not in at]
+        found = read_parts(file, path, {channel for aov in AOVS.values() for channel in aov.channels})
+    lacking = [name for name in "RGB" if name not in found]
     if lacking:
         raise ImageError(f"{path}: has no channel {lacking[0]}; give a picture with R, G and B")
+    found.setdefault("A", np.ones_like(found["R"]))
     planes = {}
     for name, aov in AOVS.items():
-        if name != "beauty" and all(channel in at for channel in aov.channels):
-            plane = pixels[..., [at[channel] for channel in aov.channels]]
+        if all(channel in found for channel in aov.channels):
+            plane = np.dstack([found[channel] for channel in aov.channels])
             planes[name] = np.ascontiguousarray(plane[..., 0] if aov.scalar else plane, np.float32)
-    alpha = pixels[..., at["A"]] if "A" in at else np.ones(pixels.shape[:2], np.float32)
-    return {"beauty": np.dstack([*(pixels[..., at[c]] for c in "RGB"), alpha]).astype(np.float32), **planes}
+    return planes
 
 
 def _linear_premultiplied(rgba: NDArray[Any], integer: bool, straight: bool) -> F32:
     """Pixels of a file as `beauty`, shape (H, W, 4)."""
-    out = rgba.astype(np.float32) / np.float32(255.0) if rgba.dtype == np.uint8 else rgba.astype(np.float32)
+    out = as_floats(rgba)
     if integer:
         out[..., :3] = srgb_decode(out[..., :3])
     if straight:
@@ -142,16 +146,24 @@ def png_bytes(rgb: NDArray[np.uint8]) -> bytes:
     return encoded("picture.png", np.ascontiguousarray(rgb), spec)
 
 
+def layered(path: str) -> bool:
+    """The format holds many planes."""
+    return _extension(path) in LAYERED
+
+
 def default_aovs(path: str, available: Sequence[str]) -> tuple[str, ...]:
     """What a file holds when nobody says: everything in an EXR, the picture elsewhere."""
     return tuple(available) if _extension(path) in LAYERED else ("beauty",)
 
 
-def check_output(path: str, aovs: Sequence[str], color_correction: str) -> None:
+def check_output(
+    path: str, aovs: Sequence[str], color_correction: str, layout: Layout = USUAL, mattes: bool = False
+) -> None:
     """Refuse, before any work, what `write_frame` could not write.
 
     Raises:
-        UsageError: the extension, an AOV or the correction is unknown, or the format cannot hold these AOVs.
+        UsageError: the extension, an AOV, the correction or something of the layout is unknown, or the format cannot
+            hold these AOVs, or no mattes.
     """
     extension = _extension(path)
     check_names(aovs)
@@ -161,7 +173,12 @@ def check_output(path: str, aovs: Sequence[str], color_correction: str) -> None:
             f"choose from {', '.join(COLOR_CORRECTIONS)}"
         )
     if extension in LAYERED:
+        check_layout(layout, aovs, mattes)
         return
+    if mattes:
+        raise UsageError(f"{path}: Cryptomatte is ids, which {extension} cannot hold; write a .exr file")
+    if layout != USUAL:
+        raise UsageError(f"{path}: is no .exr file, so EXR compression and parts mean nothing; leave them out")
     if len(aovs) > 1:
         raise UsageError(
             f"{path}: {extension} holds one AOV, but {', '.join(aovs)} are asked for; name one, or write a .exr file"
@@ -174,8 +191,8 @@ def check_writable(path: str) -> None:
     """Refuse, before any work, a place where no file can be written.
 
     Raises:
-        UsageError: the extension is unknown.
-        ImageError: the folder does not exist or is read-only, or `path` is a folder.
+        UsageError: the extension is unknown, the folder does not exist, or `path` is one.
+        ImageError: the folder cannot be written.
     """
     _extension(path)
     check_place(path, ImageError)
@@ -188,35 +205,56 @@ def write_frame(
     *,
     color_correction: str = "sRGB",
     names: Mapping[str, str] | None = None,
+    layout: Layout = USUAL,
+    mattes: Sequence[Matte] = (),
+    attributes: Mapping[str, Attribute] | None = None,
+    place: tuple[int, int, int, int] | None = None,
 ) -> None:
     """Write planes to a file, in one step: the file appears whole, or not at all.
 
     Args:
-        path: `.exr` takes any planes as scene-linear channels, colours as half and data as float32; the 8-bit formats
-            take exactly one.
+        path: `.exr` takes any planes as scene-linear channels, Z and P as float32 and the rest as half, but for data
+            that is larger than halfs get; the 8-bit formats take exactly one.
         planes: AOV name -> float32, shapes as `aovs.shape_of`.
         metadata: attributes of the file, where the format has a place for them (EXR; PNG as text).
         color_correction: `sRGB`, `disabled` or `openColorIO`; colours in 8-bit files only.
         names: AOV -> what its channels are called in an .exr, where that is another name; see `aovs.channels_of`.
+        layout: how an .exr is cut up and compressed.
+        mattes: for an .exr, as more parts of it.
+        attributes: more that the head of an .exr says, see `exr.parts_of`.
+        place: column and row of the first pixel in a larger picture, and its width and height: the file's data window
+            and display window, or a text in a PNG. Other formats hold that part of the picture alone.
 
     Raises:
         UsageError: see `check_output`.
         ImageError: the file cannot be written.
     """
-    check_output(path, tuple(planes), color_correction)
+    check_output(path, tuple(planes), color_correction, layout, bool(mattes))
     if not planes:
         raise UsageError(f"{path}: no AOV is chosen; name at least one")
     height, width = next(iter(planes.values())).shape[:2]
     for name, plane in planes.items():
         if plane.shape != shape_of(name, height, width):
             raise ImageError(f"{path}: plane '{name}' has shape {plane.shape}, not {shape_of(name, height, width)}")
-    pixels: NDArray[Any]
     if _extension(path) in LAYERED:
-        pixels, spec = _exr(planes, metadata, height, width, names or {})
-    else:
-        ((name, plane),) = planes.items()
-        pixels, spec = _eight_bit(path, name, plane, metadata, color_correction)
+        parts = parts_of(planes, mattes, {**metadata, **(attributes or {})}, names or {}, layout)
+        if place is not None:
+            for part in parts:
+                set_place(part.spec, place)
+        write_whole(path, encoded_parts(path, parts), ImageError)
+        return
+    ((name, plane),) = planes.items()
+    pixels, spec = _eight_bit(path, name, plane, metadata, color_correction)
+    if place is not None:
+        set_place(spec, place)
     write_whole(path, encoded(path, pixels, spec), ImageError)
+
+
+def set_place(spec: Any, place: tuple[int, int, int, int]) -> None:
+    """Say in OpenImageIO's description of a file where in a larger picture its pixels are."""
+    spec.x, spec.y, spec.full_width, spec.full_height = place
+    spec.full_x = spec.full_y = 0
+    spec.attribute(PLACE, "{} {} {} {}".format(*place))
 
 
 def write_map(path: str, plane: F32, metadata: Mapping[str, str | float]) -> None:
@@ -243,28 +281,6 @@ def _extension(path: str) -> str:
         known = ", ".join(LAYERED + EIGHT_BIT)
         raise UsageError(f"{path}: '{extension}' is not a known image extension; use one of {known}")
     return extension
-
-
-def _exr(
-    planes: Mapping[str, F32],
-    metadata: Mapping[str, str | float],
-    height: int,
-    width: int,
-    titles: Mapping[str, str],
-) -> tuple[F32, Any]:
-    """Planes side by side as the channels of one EXR, and OpenImageIO's description of it."""
-    names: list[str] = []
-    formats: list[str] = []
-    columns: list[F32] = []
-    for name, plane in planes.items():
-        aov = AOVS[name]
-        names += channels_of(name, titles.get(name, name))
-        formats += ["half" if aov.color else "float"] * len(aov.channels)
-        column = plane.reshape(height, width, len(aov.channels))
-        # A colour beyond the largest half would become infinity, which no viewer averages well.
-        columns.append(np.clip(column, -HALF_MAX, HALF_MAX) if aov.color else column)
-    pixels = np.ascontiguousarray(np.concatenate(columns, axis=2), dtype=np.float32)
-    return pixels, exr_spec(width, height, names, formats, metadata)
 
 
 def _eight_bit(
@@ -310,7 +326,7 @@ def display(name: str, plane: F32, color_correction: str = "sRGB") -> NDArray[np
     """
     aov = AOVS[name]
     values = plane.reshape(*plane.shape[:2], len(aov.channels)).astype(np.float32)
-    if name == "N":
+    if name in ("N", "denoising_normal"):
         values = values * 0.5 + 0.5
     if aov.color:
         if values.shape[2] == 4:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..scene import F32, F64
-from .srgb import srgb_decode
+from .srgb import as_floats, srgb_decode
 
 AUTO, RAW, SRGB = "auto", "raw", "sRGB"
 """What a picture's own format says, numbers as they are (linear Rec. 709 too), and sRGB's curve."""
@@ -41,6 +41,10 @@ _P3 = _Gamut((0.680, 0.320), (0.265, 0.690), (0.150, 0.060), _D65)
 _ADOBE = _Gamut((0.64, 0.33), (0.21, 0.71), (0.15, 0.06), _D65)
 _AP0 = _Gamut((0.7347, 0.2653), (0.0, 1.0), (0.0001, -0.0770), _D60)
 _AP1 = _Gamut((0.713, 0.293), (0.165, 0.830), (0.128, 0.044), _D60)
+LINEAR_REC709 = "lin_rec709_scene"
+"""The space that the renderer computes in, by the name of the Color Interop Forum."""
+CHROMATICITIES_REC709 = (*_REC709.red, *_REC709.green, *_REC709.blue, *_REC709.white)
+"""Its primaries and its white, as OpenEXR has them."""
 _XYZ = _Gamut((1.0, 0.0), (0.0, 1.0), (0.0, 0.0), _D65)
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 
@@ -185,7 +189,7 @@ def picture(pixels: NDArray[np.uint8] | F32, space: str, *, encoded: bool) -> F3
         space: one of `NAMES`, but not auto.
         encoded: its numbers carry the curve of the space, which those of half and float files do not.
     """
-    out = pixels.astype(np.float32) / np.float32(255.0) if pixels.dtype == np.uint8 else pixels.astype(np.float32)
+    out = as_floats(pixels)
     matrix = to_rec709(space).T.astype(np.float32)
     for row in out:  # row by row: of the whole picture, each step would be one more copy
         rgb = decoded(row[:, :3], space) if encoded else row[:, :3]

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
-from ..scene import F32
+import numpy as np
+from numpy.typing import NDArray
+
+from ..scene import F32, Texture
 
 
 def srgb_decode(encoded: F32) -> F32:
@@ -25,3 +28,17 @@ def srgb_encode(linear: F32) -> F32:
     """
     high = 1.055 * np.maximum(linear, 0.0031308) ** (1.0 / 2.4) - 0.055
     return np.where(linear <= 0.0031308, linear * 12.92, high).astype(np.float32)
+
+
+def as_floats(pixels: NDArray[Any]) -> F32:
+    """A copy of pixels as float32; bytes become 0 .. 1, still with the curve that they have."""
+    out = pixels.astype(np.float32)
+    return out / np.float32(255.0) if pixels.dtype == np.uint8 else out
+
+
+def linear_pixels(texture: Texture) -> F32:
+    """A copy of a texture's pixels in linear light, shape (H, W, 4)."""
+    out = as_floats(texture.pixels)
+    if texture.srgb:
+        out[..., :3] = srgb_decode(out[..., :3])
+    return out

@@ -55,7 +55,7 @@ def probe_digest(scene: Scene, probe: Probe) -> str:
         scene: at the time that the picture is of, with the default purposes.
         probe: of that scene.
     """
-    wanted = None if probe.captured is None else set(probe.captured)
+    wanted = None if probe.captured is None else frozenset(probe.captured)
     seen: list[bytes] = []
     things: tuple[Mesh | Sphere, ...] = (*scene.meshes, *scene.spheres)
     emits = [material.emits for material in scene.materials]
@@ -64,10 +64,10 @@ def probe_digest(scene: Scene, probe: Probe) -> str:
             seen.append(_of_thing(scene, thing))
     for many in scene.instances:
         if many.mesh.static or probe.mode == "realtime":
-            seen.append(_instances(scene, many if wanted is None else within(many, frozenset(wanted))))
+            seen.append(_instances(scene, many if wanted is None else within(many, wanted)))
     for balls in scene.balls:
         if balls.static or probe.mode == "realtime":
-            seen.append(_balls(scene, balls if wanted is None else within(balls, frozenset(wanted))))
+            seen.append(_balls(scene, balls if wanted is None else within(balls, wanted)))
     total = hashlib.sha256()
     _feed(total, "capture", probe.capture_point, probe.clipping, probe.resolution)
     _feed(total, "background", () if probe.background is None else probe.background)
@@ -192,13 +192,12 @@ def _instances(scene: Scene, many: Instances) -> bytes:
     mesh = _mesh(scene, many.mesh) if len(many) else b""
     if not mesh:
         return b""
-    read = {name for m in _used(many.mesh) for name in _primvars_of(scene.materials[m])}
+    materials = [scene.materials[m] for m in _used(many.mesh)]
+    read = {name for material in materials if not material.refractive for name in _primvars_of(material)}
     names = sorted(read & many.primvars.keys())
     columns = [many.transforms.reshape(len(many), -1), *(many.primvars[name] for name in names)]
-    rows = np.ascontiguousarray(np.concatenate(columns, axis=1), np.float32)
-    order = np.lexsort(rows.view(np.uint32).T)
     total = hashlib.sha256()
-    _feed(total, "instances", mesh, *names, rows[order])
+    _feed(total, "instances", mesh, *names, _sorted_rows(columns))
     return total.digest()
 
 
@@ -208,12 +207,18 @@ def _balls(scene: Scene, balls: Balls) -> bytes:
     if material.refractive or not len(balls):
         return b""
     names = sorted(set(_primvars_of(material)) & balls.primvars.keys())
-    every = {name: balls.primvars[name].reshape(-1, balls.primvars[name].shape[-1]) for name in names}
-    values = [np.broadcast_to(value, (len(balls), value.shape[1])) for value in every.values()]
-    rows = np.ascontiguousarray(np.concatenate([balls.centres, balls.radii[:, None], *values], axis=1), np.float32)
+    every = [balls.primvars[name].reshape(-1, balls.primvars[name].shape[-1]) for name in names]
+    values = [np.broadcast_to(value, (len(balls), value.shape[1])) for value in every]
     total = hashlib.sha256()
-    _feed(total, "balls", _material(scene, balls.material), *names, rows[np.lexsort(rows.view(np.uint32).T)])
+    rows = _sorted_rows([balls.centres, balls.radii[:, None], *values])
+    _feed(total, "balls", _material(scene, balls.material), *names, rows)
     return total.digest()
+
+
+def _sorted_rows(columns: list[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """Columns of many places side by side, in an order that does not depend on how the places came."""
+    rows = np.ascontiguousarray(np.concatenate(columns, axis=1), np.float32)
+    return rows[np.lexsort(rows.view(np.uint32).T)]
 
 
 # --- materials and light

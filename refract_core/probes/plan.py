@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..scene import Camera, Material, Notice, Param, Probe, Scene, Volume, prim_of
 from ..world.embree import CASTER_SHIFTS, FIRST_CAPTURED_BIT, OPAQUE, OPAQUE_STATIC
-from ..world.instances import boxes, thing_count
+from ..world.instances import boxes, numbered, thing_count
 from ..world.tables import caster_sets
 from .lookup import bounds_of, camera_weight
 
@@ -87,15 +87,11 @@ def plan_picture(scene: Scene, camera: Camera, *, drawn: bool, proxies: bool) ->
 def _lend_proxies(scene: Scene, glass: _Glass, thing_probe: NDArray[np.int32], entries: list[Entry]) -> None:
     """A box to guess by for all glass that no probe serves. Things beyond `_MOST_PROXIES` share one around them all."""
     bare = np.flatnonzero(thing_probe[glass.thing] < 0)
-    for row in bare[:_MOST_PROXIES]:
-        thing_probe[glass.thing[row]] = len(entries)
-        box = (glass.low[row], glass.high[row]) if scene.probes else scene.bounds
-        entries.append(Entry(_bare_proxy(box), 0, False))
-    rest = bare[_MOST_PROXIES:]
-    if len(rest):
-        thing_probe[glass.thing[rest]] = len(entries)
-        box = (glass.low[rest].min(axis=0), glass.high[rest].max(axis=0)) if scene.probes else scene.bounds
-        entries.append(Entry(_bare_proxy(box), 0, False))
+    for rows in (*bare[:_MOST_PROXIES, None], bare[_MOST_PROXIES:]):
+        if len(rows):
+            thing_probe[glass.thing[rows]] = len(entries)
+            box = (glass.low[rows].min(axis=0), glass.high[rows].max(axis=0)) if scene.probes else scene.bounds
+            entries.append(Entry(_bare_proxy(box), 0, False))
 
 
 def _serves(probe: Probe, camera: Camera, glass: _Glass) -> bool:
@@ -132,33 +128,31 @@ class _Glass(NamedTuple):
 def _glass(scene: Scene) -> _Glass:
     refractive = np.array([m.refractive for m in scene.materials], bool)
     found: list[tuple[Any, Any, Any, Any]] = [(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))]
+
+    def add(first: int, low: NDArray[np.float64], high: NDArray[np.float64], used: Iterable[int]) -> None:
+        count = len(low)
+        found.append((first + np.arange(count), low, high, np.full(count, _longest_thickness(scene, used))))
+
     for thing, mesh in enumerate(scene.meshes):
         keep = refractive[mesh.materials]
         if keep.any():
             points = mesh.points[mesh.triangles[keep].ravel()].astype(np.float64)
-            longest = _longest_thickness(scene, np.unique(mesh.materials))
-            found.append(([thing], points.min(0)[None], points.max(0)[None], [longest]))
-    for i, ball in enumerate(scene.spheres):
+            add(thing, points.min(0)[None], points.max(0)[None], np.unique(mesh.materials))
+    for thing, ball in enumerate(scene.spheres, len(scene.meshes)):
         if refractive[ball.material]:
             centre = np.array([ball.centre], np.float64)
-            longest = _longest_thickness(scene, [ball.material])
-            found.append(([len(scene.meshes) + i], centre - ball.radius, centre + ball.radius, [longest]))
-    first = len(scene.meshes) + len(scene.spheres)
-    for many in scene.instances:
+            add(thing, centre - ball.radius, centre + ball.radius, [ball.material])
+    instances, clouds = numbered(scene)
+    for first, many in instances:
         keep = refractive[many.mesh.materials]
         if keep.any() and len(many):
             corners = np.unique(many.mesh.triangles[keep])
-            longest = _longest_thickness(scene, np.unique(many.mesh.materials))
             low, high = boxes(many, many.mesh.points[corners].astype(np.float64))
-            found.append((first + np.arange(len(many)), low, high, np.full(len(many), longest)))
-        first += len(many)
-    for balls in scene.balls:
-        if refractive[balls.material] and len(balls):
+            add(first, low, high, np.unique(many.mesh.materials))
+    for first, balls in clouds:
+        if refractive[balls.material]:
             centres, radii = balls.centres.astype(np.float64), balls.radii[:, None].astype(np.float64)
-            longest = _longest_thickness(scene, [balls.material])
-            each = first + np.arange(len(balls)), centres - radii, centres + radii, np.full(len(balls), longest)
-            found.append(each)
-        first += len(balls)
+            add(first, centres - radii, centres + radii, [balls.material])
     return _Glass(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 

@@ -70,7 +70,7 @@ def _throws_caustics(world: World) -> NDArray[np.bool_]:
         refractive = own.size > 0 and bool((own != 0).all()) and not materials.cutout[used].any()
         bends = bool(np.isin(materials.drawn[used], _BENDING).all())
         if refractive and bends and not geometry.sheet[g]:
-            casts[g] = geometry.sphere[g, 3] > 0.0 or geometry.ball[g] >= 0 or not _is_plate(world, g)
+            casts[g] = len(balls_of(geometry, g)) > 0 or not _is_plate(world, g)
     return casts
 
 
@@ -135,48 +135,39 @@ def _shadowing(world: World) -> list[int]:
 def _pieces(
     world: World, casts: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], F64]:
-    """Part, place, primitive and area [m^2] of all triangles of glass, neighbours together, and of spheres' patches. Of
-    very many places of one mesh, an even choice stands for all."""
+    """Part, place, primitive and area [m^2] of all triangles of glass, neighbours together, and of spheres' patches."""
     found: list[tuple[Any, Any, Any, Any]] = []
     for g in np.flatnonzero(casts):
-        radius = float(world.geometry.sphere[g, 3])
-        if radius > 0.0:
-            count = BANDS * SECTORS
-            order, area = np.arange(count), np.full(count, 4.0 * math.pi * radius * radius / count)
-            found.append((np.full(count, g), np.zeros(count, np.int64), order, area))
-            continue
-        if world.geometry.ball[g] >= 0:
-            found.append(_patches(world, int(g)))
-            continue
-        corners, transforms = _corners(world, int(g)), places_of(world.geometry, int(g))
-        order = along_a_curve(corners.mean(axis=1))
-        chosen, share = np.zeros(1, np.int64), 1.0
-        if len(transforms) > 1:
-            chosen = along_a_curve(transforms[:, :, 3].astype(np.float64))
-            most = max(1, _MOST_SOURCES // len(order))
-            if len(chosen) > most:
-                chosen, share = chosen[np.linspace(0, len(chosen) - 1, most).astype(np.int64)], len(chosen) / most
-        area = share * _spread(transforms[chosen], across(corners))[:, order].ravel()
-        places, primitives = np.repeat(chosen, len(order)), np.tile(order, len(chosen))
+        balls = balls_of(world.geometry, int(g)).astype(np.float64)
+        places, primitives, area = _patches(balls) if len(balls) else _triangles(world, int(g))
         found.append((np.full(len(places), g), places, primitives, area))
     whose, instances, primitives, sizes = (np.concatenate(column) for column in zip(*found, strict=True))
     return whose, instances, primitives, sizes
 
 
-def _patches(
-    world: World, part: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], F64]:
-    """The same of many spheres."""
-    balls = balls_of(world.geometry, part).astype(np.float64)
+def _triangles(world: World, part: int) -> tuple[NDArray[np.int64], NDArray[np.int64], F64]:
+    """Place, number and area [m^2] of a part's triangles; of very many places, an even choice stands for all."""
+    corners, transforms = _corners(world, part), places_of(world.geometry, part)
+    order, chosen = along_a_curve(corners.mean(axis=1)), along_a_curve(transforms[:, :, 3].astype(np.float64))
+    most = max(1, _MOST_SOURCES // len(order))
+    if len(chosen) > most:
+        chosen = chosen[np.linspace(0, len(chosen) - 1, most).astype(np.int64)]
+    area = len(transforms) / len(chosen) * _spread(transforms[chosen], across(corners))[:, order].ravel()
+    return np.repeat(chosen, len(order)), np.tile(order, len(chosen)), area
+
+
+def _patches(balls: F64) -> tuple[NDArray[np.int64], NDArray[np.int64], F64]:
+    """Place, number and area [m^2] of patches of spheres; of very many spheres, an even choice stands for all.
+    `balls`: shape (N, 4)."""
     chosen, count = along_a_curve(balls[:, :3]), BANDS * SECTORS
+    squares = balls[:, 3] ** 2
     most = max(1, _MOST_SOURCES // count)
     if len(chosen) > most:  # of equal area each, about
-        steps = np.cumsum(balls[chosen, 3] ** 2)
+        steps = np.cumsum(squares[chosen])
         chosen = chosen[np.searchsorted(steps / steps[-1], (np.arange(most) + 0.5) / most)]
-    share = (balls[:, 3] ** 2).sum() / (balls[chosen, 3] ** 2).sum()
-    area = np.repeat(share * 4.0 * math.pi * balls[chosen, 3] ** 2 / count, count)
-    places = np.repeat(chosen, count)
-    return np.full(len(places), part), places, np.tile(np.arange(count), len(chosen)), area
+    share = squares.sum() / squares[chosen].sum()
+    area = np.repeat(share * 4.0 * math.pi * squares[chosen] / count, count)
+    return np.repeat(chosen, count), np.tile(np.arange(count), len(chosen)), area
 
 
 def _bodies_around(world: World, scene: Scene, light: int, parts: NDArray[np.int64]) -> list[int]:
@@ -188,19 +179,13 @@ def _bodies_around(world: World, scene: Scene, light: int, parts: NDArray[np.int
     found = []
     for g in parts:
         thing, surface = int(world.geometry.thing[g]), int(world.geometry.surface[g])
-        if world.geometry.sphere[g, 3] > 0.0:
-            if math.dist(at, world.geometry.sphere[g, :3]) < world.geometry.sphere[g, 3]:
-                found.append(surface)
-            continue
-        if world.geometry.ball[g] >= 0:
-            balls = balls_of(world.geometry, int(g)).astype(np.float64)
+        balls = balls_of(world.geometry, int(g)).astype(np.float64)
+        if len(balls):
             inside = np.linalg.norm(balls[:, :3] - at, axis=1) < balls[:, 3]
             found += (surface + np.flatnonzero(inside)).tolist()
-            continue
-        if world.geometry.place[g] >= 0:
+        elif world.geometry.place[g] >= 0:
             found += [surface + k for k in around(instances_at(scene, thing), at)]
-            continue
-        if encloses(scene.meshes[thing].points, scene.meshes[thing].triangles, at):
+        elif encloses(scene.meshes[thing].points, scene.meshes[thing].triangles, at):
             found.append(surface)
     return found
 
@@ -210,11 +195,8 @@ def _bodies_around(world: World, scene: Scene, light: int, parts: NDArray[np.int
 
 def _bounds(world: World, part: int) -> tuple[F64, F64]:
     """Middles (N, 3) and radii (N,) of the boxes of a part in its places [m]."""
-    ball = world.geometry.sphere[part]
-    if ball[3] > 0.0:
-        return ball[None, :3].astype(np.float64), ball[3:].astype(np.float64)
-    if world.geometry.ball[part] >= 0:
-        balls = balls_of(world.geometry, part).astype(np.float64)
+    balls = balls_of(world.geometry, part).astype(np.float64)
+    if len(balls):
         return balls[:, :3], balls[:, 3]
     corners = _corners(world, part).reshape(-1, 3)
     low, high = corners.min(axis=0), corners.max(axis=0)

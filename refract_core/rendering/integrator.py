@@ -14,6 +14,8 @@ class Pass(NamedTuple):
     items: Sequence[Any]
     share: float
     """of the whole work, about"""
+    samples: int = 0
+    """that the planes hold of an item once it is drawn; 0 for a pass that draws something else. Its items are tiles"""
 
 
 class Integrator(Protocol):

@@ -5,15 +5,21 @@ stage -> Scene -> tables and BVH -> probes -> per sample: the integrator's passe
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..images.frame import Frame
+from ..errors import Cancelled, TimeUp
+from ..images.denoise import check_installed
+from ..images.frame import Frame, Place
 from ..kernels.lanes import by_address
 from ..models import BY_TOKEN, SHEET, Behind
 from ..probes.capture import Over, face_camera, paste_face
@@ -22,15 +28,20 @@ from ..probes.plan import seen_things
 from ..progress import COMPILING
 from ..scene import F32, Camera, Notice, Probe, Scene, prim_of
 from ..settings import RenderSettings
+from ..studio.compose import dressed
 from ..version import __version__
-from ..view.camera import image_size, view_of
-from ..view.planes import by_name, finish_of, finish_tile, new_planes
+from ..view.camera import Tile, View, image_size, view_of
+from ..view.crop import meeting, part_of, window_of
+from ..view.planes import Planes, by_name, finish_of, finish_tile, new_planes
 from ..world.embree import Bvh
 from ..world.instances import settled, thing_count, within
 from ..world.tables import World
 from .branching import Tree, needs_compiling, sample_views
-from .ready import PROBE_SAMPLES, Ready, choose_camera, prepare, prepare_bare
+from .features import features_of, without_noise
+from .mattes import draw_mattes
+from .ready import PROBE_SAMPLES, Ready, camera_of, prepare, prepare_bare
 from .session import Session
+from .unfinished import FINISHED, Drawn, Watch
 from .work import Cancel, Progress, Work, tiles_of, working
 
 
@@ -48,6 +59,7 @@ def render(
     cancel: Cancel | None = None,
     executor: Executor | None = None,
     session: Session | None = None,
+    watch: Watch | None = None,
 ) -> Frame:
     """Render one picture of a scene.
 
@@ -56,38 +68,115 @@ def render(
         cancel: asked between tiles; True stops the render.
         executor: where tiles run; must share this process's memory. None makes `settings.jobs` threads.
         session: has what earlier pictures needed, and keeps what this one does; the picture is the same without it.
+        watch: who wants to see it before it is finished, and when to stop.
 
     Raises:
-        UsageError: no such camera, or a camera without a field of view.
+        UsageError: no such camera, or a camera without a field of view; or it is to be denoised, and that extra is
+            not installed.
         SceneError: a record of the scene is malformed.
+        ImageError: the file of surroundings cannot be read.
         Cancelled: `cancel` said so.
+        TimeUp: the watch's deadline has come before every pixel was drawn.
     """
+    started = time.perf_counter()
     settings = settings or RenderSettings()
     if not settings.camera_light:
         scene = replace(scene, camera_light=False)
     scene = settled(scene)
-    camera = choose_camera(scene, settings.camera)
+    if settings.denoise:
+        check_installed()
+    camera = camera_of(scene, settings)
+    scene, around = dressed(scene, camera, settings)
     width, height = image_size(camera, settings.image_width, settings.image_height)
+    window = window_of(settings, width, height)
+    whole = window == (0, 0, width, height)
     with working(executor, settings.jobs, progress, cancel) as work:
         if needs_compiling(_as_drawn(settings, camera)):
             work.progress(0.0, COMPILING)
-        ready = prepare(scene, camera, settings, work, glass_over(scene, camera, settings, work), session)
-        planes, rays = _draw(ready, scene, camera, settings, (width, height), work)
+        limited = work._replace(cancel=lambda: work.cancel() or (watch is not None and watch.is_over()))
+        with _time_up(work, watch):
+            over = glass_over(scene, camera, settings, limited)
+            ready = prepare(scene, camera, settings, limited, over, session)
+        x0, y0, x1, y1 = window
+        place = None if whole else Place(x0, y0, width, height)
+        metadata: dict[str, str | float] = {
+            "software": f"refract {__version__}",
+            "refract:stage": _file_name(scene.name),
+            "refract:camera": camera.path,
+            "refract:timeCode": scene.time_code,
+            "refract:samples": float(settings.samples),
+            "refract:tiers": ",".join(settings.tiers),
+            "refract:screen": settings.screen,
+            "refract:metersPerUnit": scene.metres_per_unit,
+        }
+        seen_by = camera_attributes(scene, camera, (width, height))
+
+        def so_far(planes: dict[str, F32], finished: float) -> Frame:
+            """What is drawn, for who wants to see it."""
+            return Frame(x1 - x0, y1 - y0, planes, {**metadata, FINISHED: finished}, (), seen_by, place=place)
+
+        stopped: tuple[Notice, ...] = ()
+        if watch is None:
+            planes, rays = _draw(ready, scene, camera, settings, (width, height), work, window)
+        else:
+            drawn = _watched(ready, scene, camera, settings, (width, height), work, window, watch, so_far)
+            planes, rays, finished, stopped = drawn
+            if finished < 1.0:
+                metadata[FINISHED] = finished
+        if settings.denoise or settings.features:
+            rays += _guide(planes, ready, scene, camera, settings, work, (width, height), window)
+        mattes, matte_rays = draw_mattes(ready, scene, camera, settings, (width, height), work, window)
         work.progress(1.0, "done")
-    metadata: dict[str, str | float] = {
-        "software": f"refract {__version__}",
-        "refract:stage": _file_name(scene.name),
-        "refract:camera": camera.path,
-        "refract:timeCode": scene.time_code,
-        "refract:samples": float(settings.samples),
-        "refract:tiers": ",".join(settings.tiers),
-        "refract:screen": settings.screen,
-        "refract:metersPerUnit": scene.metres_per_unit,
-        "refract:rays": float(rays + ready.rays),
-    }
-    notices = scene.notices + camera_light(scene) + open_meshes(scene, settings.model) + glass_twice(scene, settings)
-    notices += ready.notices + lens_of_few(camera, settings) + nothing_seen(scene, camera, planes)
-    return Frame(width, height, planes, metadata, notices)
+    metadata["refract:rays"] = float(rays + ready.rays + matte_rays)
+    if settings.denoise:
+        metadata["refract:denoised"] = "Open Image Denoise"
+    notices = scene.notices + around + camera_light(scene) + open_meshes(scene, settings.model)
+    notices += glass_twice(scene, settings)
+    notices += ready.notices + lens_of_few(camera, settings) + out_of_range(camera, settings, planes) + stopped
+    if whole:
+        notices += nothing_seen(scene, camera, planes)
+    seconds = time.perf_counter() - started
+    return Frame(x1 - x0, y1 - y0, planes, metadata, notices, seen_by, mattes, seconds, place)
+
+
+def camera_attributes(scene: Scene, camera: Camera, size: tuple[int, int]) -> dict[str, tuple[float, ...] | float]:
+    """What a picture says of its camera, by OpenEXR's names: see `Frame.camera`.
+
+    `worldToCamera` goes from the stage's world to a camera that looks along -Z with +Y up, in the stage's units, as USD
+    has it. `worldToNDC` goes on to where x and y are -1 .. 1 over the picture, to the right and up, and z from -1 at
+    the near plane to 1 at the far one, all to be divided by w. Both are for row vectors.
+    """
+    unit = scene.metres_per_unit
+    metres = np.diag([unit, unit, unit, 1.0])  # of the camera's frame, from stage units
+    to_camera = np.linalg.inv(scene.stage_from_engine @ camera.world_from_camera @ metres)
+    left, right, bottom, top = view_of(camera, *size).window.tolist()
+    near, far = (distance / unit for distance in camera.clipping)
+    if camera.orthographic:
+        left, right, bottom, top = left / unit, right / unit, bottom / unit, top / unit
+        z_row, w_row = (0.0, 0.0, -2 / (far - near), -(far + near) / (far - near)), (0.0, 0.0, 0.0, 1.0)
+        shift_x, shift_y, place = -(right + left) / (right - left), -(top + bottom) / (top - bottom), 3
+    else:
+        z_row, w_row = (0.0, 0.0, -(far + near) / (far - near), -2 * far * near / (far - near)), (0.0, 0.0, -1.0, 0.0)
+        shift_x, shift_y, place = (right + left) / (right - left), (top + bottom) / (top - bottom), 2
+    project = np.array([np.zeros(4), np.zeros(4), z_row, w_row])
+    project[0, 0], project[1, 1] = 2 / (right - left), 2 / (top - bottom)
+    project[0, place], project[1, place] = shift_x, shift_y
+    rows = {"worldToCamera": to_camera.T, "worldToNDC": (project @ to_camera).T}
+    return {**{name: tuple(map(float, matrix.ravel())) for name, matrix in rows.items()}, "near": near, "far": far}
+
+
+def _guide(
+    planes: dict[str, F32], ready: Ready, scene: Scene, camera: Camera, settings: RenderSettings, work: Work,
+    size: tuple[int, int], window: Tile,
+) -> int:  # fmt: skip
+    """Draw what a denoiser reads, let it read that, and keep it where it is asked for. Returns rays traced."""
+    work.progress(1.0, "denoising" if settings.denoise else "image")
+    found = features_of(ready, scene, camera, settings, size, work, window)
+    if settings.denoise:
+        planes["beauty"] = without_noise(planes["beauty"], found, settings, camera)
+    if settings.features:
+        planes["albedo"], planes["denoising_normal"] = found.albedo, found.normal
+    return found.rays
 
 
 def camera_light(scene: Scene) -> tuple[Notice, ...]:
@@ -96,6 +185,11 @@ def camera_light(scene: Scene) -> tuple[Notice, ...]:
     return (Notice("/", text),) if scene.camera_light else ()
 
 
+STOPPED = "the picture was stopped by its time limit"
+"""How the notice about a picture that is whole, but not as good as asked, begins."""
+_TOO_EARLY = "the time limit has come before every pixel was drawn, and nothing was written; give it more time"
+_NEARLY = 0.9999
+"""Share that an unfinished picture says at most."""
 NOTHING_SEEN = "no pixel of the picture shows anything of the stage"
 """How the notice about a picture of nothing begins."""
 
@@ -107,6 +201,24 @@ def nothing_seen(scene: Scene, camera: Camera, planes: dict[str, NDArray[np.floa
         return ()
     text = "; look at the camera's place, its clippingRange, what is visible, and the purposes"
     return (Notice(camera.path or "/", NOTHING_SEEN + text),)
+
+
+_WHITE, _GREY = 3.0, 0.4
+"""Light from which on half of a picture being there means that it shows nothing, and what its middle should be."""
+
+
+def out_of_range(
+    camera: Camera, settings: RenderSettings, planes: dict[str, NDArray[np.float32]]
+) -> tuple[Notice, ...]:
+    """Say that most of what is there is far above white, as of files that count lights in watts, and by how much."""
+    beauty = planes["beauty"]
+    there = beauty[..., 3] > 0.0
+    light = float(np.median(beauty[..., :3].max(axis=-1)[there])) if there.any() else 0.0
+    if not _WHITE < light < math.inf:
+        return ()
+    stops = math.floor(settings.exposure - math.log2(light / _GREY))
+    text = f"most of the picture is far above white; --exposure {stops} shows it"
+    return (Notice(camera.path or "/", text),)
 
 
 _LENS_SAMPLES = 64
@@ -146,23 +258,112 @@ def glass_twice(scene: Scene, settings: RenderSettings) -> tuple[Notice, ...]:
 
 
 def _draw(
-    ready: Ready, scene: Scene, camera: Camera, settings: RenderSettings, size: tuple[int, int], work: Work
-) -> tuple[dict[str, NDArray[np.float32]], int]:
-    """All samples, averaged into planes. Returns the planes by AOV name, and rays traced."""
+    ready: Ready, scene: Scene, camera: Camera, settings: RenderSettings, size: tuple[int, int], work: Work,
+    window: Tile | None = None,
+) -> tuple[dict[str, NDArray[np.float32]], int]:  # fmt: skip
+    """All samples, averaged into planes. Returns the planes by AOV name, and rays traced.
+
+    Args:
+        window: pixels of the picture that are wanted, whose planes are returned; None is all of it.
+    """
     settings = _as_drawn(settings, camera)
-    tiles = tiles_of(*size, settings.tile_size)
+    window = window or (0, 0, *size)
     planes = new_planes(*size)
     rays, done = 0, 0.2
-    for step in Tree(ready, scene, camera, settings, tiles, planes).passes():
+    for step in Tree(ready, scene, camera, settings, window, planes).passes():
         share = 0.8 * step.share
         rays += sum(work.run(step.draw, step.items, _told(work, done, share)))
         done += share
+    return _finished(scene, camera, settings, planes, window, work), rays
+
+
+def _finished(
+    scene: Scene, camera: Camera, settings: RenderSettings, planes: Planes, window: Tile, work: Work
+) -> dict[str, NDArray[np.float32]]:
+    """Sums to values, in place; the window of them by AOV name."""
+    height, width = planes.mask.shape
+    size = width, height
     finish = by_address(finish_of(scene, settings.samples, camera.exposure_scale * 2.0**settings.exposure))
-    # Data of the picture are of one place in each pixel: its middle, or the first sample's.
-    place = view_of(camera, *size) if settings.by_corners else next(sample_views(camera, size, settings.samples))
-    first, target = by_address(place), by_address(planes)
+    first, target = by_address(_place(camera, settings, size)), by_address(planes)
+    tiles = meeting(tiles_of(*size, settings.tile_size), window)
     work.run(lambda tile: finish_tile(target, first, finish, tile), tiles)
-    return by_name(planes), rays
+    return {name: part_of(plane, window) for name, plane in by_name(planes).items()}
+
+
+def _place(camera: Camera, settings: RenderSettings, size: tuple[int, int]) -> View:
+    """Data of the picture are of one place in each pixel: its middle, or the first sample's."""
+    return view_of(camera, *size) if settings.by_corners else next(sample_views(camera, size, settings.samples))
+
+
+@contextmanager
+def _time_up(work: Work, watch: Watch | None) -> Iterator[None]:
+    """What a deadline ends is told as that, not as if a person had done it."""
+    try:
+        yield
+    except Cancelled:
+        if work.cancel() or watch is None or not watch.is_over():
+            raise
+        raise TimeUp(_TOO_EARLY) from None
+
+
+def _watched(
+    ready: Ready, scene: Scene, camera: Camera, settings: RenderSettings, size: tuple[int, int], work: Work,
+    window: Tile, watch: Watch, so_far: Callable[[dict[str, F32], float], Frame],
+) -> tuple[dict[str, F32], int, float, tuple[Notice, ...]]:  # fmt: skip
+    """As `_draw`, for somebody who wants to see it before it is finished: also what share of it is as asked, and a
+    notice where that is not all."""
+    settings = _as_drawn(settings, camera)
+    limited = work._replace(cancel=lambda: work.cancel() or watch.is_over())
+    first, rays, done = None, 0, 0.2
+    if watch.deadline < math.inf and settings.by_corners:
+        quiet = limited._replace(progress=lambda _share, _stage: None)
+        with _time_up(work, watch):
+            first, rays = _draw(ready, scene, camera, replace(settings, samples=1), size, quiet, window)
+    exposure = camera.exposure_scale * 2.0**settings.exposure
+    planes = new_planes(*size)
+    drawn = Drawn(planes, _place(camera, settings, size), lambda samples: finish_of(scene, samples, exposure))
+    tiles = 0
+    try:
+        for step in Tree(ready, scene, camera, settings, window, planes).passes():
+            share = 0.8 * step.share
+            if step.samples:
+                tiles = len(step.items) + (tiles if settings.by_corners else 0)
+            tell = _told(work, done, share)
+            looking = partial(_look, watch, drawn, settings, tiles, so_far, window)
+            told = partial(_tell_both, tell, looking) if settings.by_corners and step.samples else tell
+            rays += sum(limited.run(drawn.noting(step), step.items, told))
+            done += share
+            if not settings.by_corners and 0 < step.samples < settings.samples and watch.wanted():
+                watch.take(so_far(drawn.so_far(window), step.samples / settings.samples))
+    except Cancelled:
+        if work.cancel():
+            raise
+        least = drawn.least(tiles)
+        if first is None and not least:
+            raise TimeUp(_TOO_EARLY) from None
+        part = drawn.count(settings.samples) / max(1, tiles) if settings.by_corners else least / settings.samples
+        part = min(part, _NEARLY)
+        how = f"it has {least} of the {settings.samples} samples asked for"
+        if settings.by_corners:
+            how = f"{100.0 * part:.0f} % of it is as asked, the rest has one sample"
+        notice = Notice(camera.path or "/", f"{STOPPED}: {how}")
+        return drawn.so_far(window, first), rays, part, (notice,)
+    return _finished(scene, camera, settings, planes, window, work), rays, 1.0, ()
+
+
+def _look(
+    watch: Watch, drawn: Drawn, settings: RenderSettings, tiles: int,
+    so_far: Callable[[dict[str, F32], float], Frame], window: Tile,
+) -> None:  # fmt: skip
+    """Show what is finished so far, if there is any and somebody wants to see it."""
+    done = drawn.count(settings.samples)
+    if done and watch.wanted():
+        watch.take(so_far(drawn.so_far(window), min(done / tiles, _NEARLY)))
+
+
+def _tell_both(tell: Callable[[float], None], look: Callable[[], None], part: float) -> None:
+    tell(part)
+    look()
 
 
 def _told(work: Work, done: float, share: float) -> Callable[[float], None]:

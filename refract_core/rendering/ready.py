@@ -16,7 +16,8 @@ from ..probes.capture import Over, Run, cubemap_of, fill_table
 from ..probes.lookup import ProbeTable, empty_table
 from ..probes.plan import Entry, Plan, plan_capture, plan_picture
 from ..scene import Camera, Cubemap, Notice, Param, Probe, Scene
-from ..settings import RenderSettings
+from ..settings import NO_CROP, NO_ORBIT, RenderSettings
+from ..view.orbit import orbit
 from ..world import environment, textures
 from ..world.embree import Bvh
 from ..world.emitters import what_glows
@@ -66,6 +67,20 @@ def choose_camera(scene: Scene, name: str) -> Camera:
     raise UsageError(f"--camera {name}: the stage has no such camera; it has {known}")
 
 
+def camera_of(scene: Scene, settings: RenderSettings) -> Camera:
+    """The camera that takes the picture: one of the scene's, or one of its own by the model of `view.orbit`.
+
+    Raises:
+        UsageError: no such camera, or nothing to look at.
+    """
+    if settings.orbits and not settings.camera:
+        return orbit(scene, settings)
+    chosen = choose_camera(scene, settings.camera)
+    if settings.orbits:
+        return orbit(scene, settings, chosen)
+    return orbit(scene, settings) if chosen.framing else chosen
+
+
 def prepare(
     scene: Scene,
     camera: Camera,
@@ -107,11 +122,14 @@ def _prepare(
     span: tuple[float, float],
     over: Callable[[World, Bvh], Over] | None = None,
 ) -> Ready:
+    work.progress(0.0, "building")
     geometry, bvh, slots = pack_geometry(scene, chosen.captured_sets)
     images, sky = textures.pack(scene.textures), environment.pack(scene.environment)
     plain = _lit(scene, camera, settings, geometry, pack_materials(scene.materials, slots, settings.model), images, sky)
+    _tell_caustics(work, settings, span)
     thrown = caustics_of(plain, scene, plan_caustics(plain, camera, settings), work)
     lit = with_caustics(plain, thrown)
+    _tell_indirect(work, settings, span)
     world = by_address(lit._replace(bounced=indirect_of(lit, camera, settings, work)))
     entries = chosen.entries
     table = empty_table([e.probe for e in entries], [e.drawn for e in entries], camera, rough)
@@ -129,13 +147,24 @@ def _lit(
     images: textures.TextureTable,
     sky: environment.EnvironmentTable,
 ) -> World:
-    """The tables together, with what the stage's own surfaces emit among the lights."""
+    """The tables together, with what the stage's own surfaces emit among the lights, if any surface spreads light: what
+    mirrors sees what glows itself."""
     eye = camera.world_from_camera[:3, 3]
     unlit = pack_lights(replace(scene, lights=(), camera_light=False), eye)
     glow = None
-    if settings.emission_light:
+    if settings.emission_light and materials.spreads[geometry.material].any():
         glow = what_glows(world_of(geometry, materials, images, unlit, sky), scene, eye)
     return world_of(geometry, materials, images, pack_lights(scene, eye, glow), sky)
+
+
+def _tell_caustics(work: Work, settings: RenderSettings, span: tuple[float, float]) -> None:
+    if settings.caustics:
+        work.progress(0.2 * span[0], "caustics")
+
+
+def _tell_indirect(work: Work, settings: RenderSettings, span: tuple[float, float]) -> None:
+    if settings.indirect != "off":
+        work.progress(0.6 * span[0], "light between surfaces")
 
 
 def _runner(work: Work, span: tuple[float, float]) -> Run:
@@ -167,6 +196,7 @@ def _from_parts(
     over: Callable[[World, Bvh], Over] | None,
 ) -> Ready:
     """As `_prepare`, part by part. The tables of materials and lights are made anew: they cost less than to compare."""
+    work.progress(0.0, "building")
     hierarchy = session.part(
         "geometry", _geometry_source(scene, chosen), lambda: pack_geometry(scene, chosen.captured_sets)
     )
@@ -175,10 +205,12 @@ def _from_parts(
     geometry, bvh, slots = hierarchy.made
     materials = pack_materials(scene.materials, slots, settings.model)
     plain = _lit(scene, camera, settings, geometry, materials, images.made, sky.made)
+    _tell_caustics(work, settings, span)
     wanted_light = plan_caustics(plain, camera, settings)
     seen = hierarchy.number, images.number, sky.number, tuple(plain.lights), scene.materials, settings.model
     thrown = session.part("caustics", (*seen, wanted_light), lambda: caustics_of(plain, scene, wanted_light, work))
     lit = with_caustics(plain, thrown.made)
+    _tell_indirect(work, settings, span)
     looked_at: Any = None
     if settings.indirect != "off":
         looked_at = *seen, thrown.number, camera, settings.image_width, settings.image_height, settings.indirect
@@ -189,8 +221,9 @@ def _from_parts(
     drawn = [entry for entry in chosen.entries if entry.drawn]
     # Probes that do not see glass still see what has come through it.
     shown = *seen, thrown.number, sent_on.number, rough, samples
-    # A probe that sees glass is drawn as a picture is, from the scene itself; how the work is cut up never changes it.
-    asked = replace(settings, jobs=0, tile_size=64)
+    # A probe that sees glass is drawn as a picture is, from the scene itself; how the work is cut up never changes it,
+    # nor what is done to the picture afterwards.
+    asked = replace(settings, jobs=0, tile_size=64, denoise=False, features=False, **NO_ORBIT, **NO_CROP)
     glassy = asked, scene.bounds, scene.metres_per_unit
     wanted: dict[Hashable, tuple[Any, Callable[[], _Capture]]] = {}
     for k, entry in enumerate(drawn):

@@ -87,6 +87,14 @@ def _new_row(answers: Answers, slot: int) -> int:
 
 
 @inlined
+def way_to(leaves: Rays, k: int, query: Query, lane: int, world: World) -> int:
+    """A number for the way to leaf `k` and the surface that it meets."""
+    hit = kept_hit(query.met, lane)
+    what = surface_of(world.geometry, hit) if query.blur[lane] <= 0.0 and hit.part != NOTHING else NOTHING
+    return int(np.int32(hash32(leaves.way[k], what, 0)))
+
+
+@inlined
 def add_answer(answers: Answers, slot: int, leaves: Rays, k: int, query: Query, lane: int, world: World) -> None:
     """Keep what leaf `k` was answered in a lane."""
     if answers.on[0] == 0:
@@ -98,8 +106,7 @@ def add_answer(answers: Answers, slot: int, leaves: Rays, k: int, query: Query, 
     keep_hit(answers.hits, r, hit)
     d = row(leaves.direction, k)
     sharp = query.blur[lane] <= 0.0  # the ray in the middle of a cone says nothing about the rest of it
-    what = surface_of(world.geometry, hit) if sharp and hit.part != NOTHING else NOTHING
-    answers.way[r] = np.int32(hash32(leaves.way[k], what, 0))
+    answers.way[r] = way_to(leaves, k, query, lane, world)
     answers.side[r] = max(THROUGH_SIDE, leaves.side[k])  # what an eye in glass sees has come through, too
     put(answers.weight, r, row(leaves.weight, k))
     put(answers.direction, r, d)

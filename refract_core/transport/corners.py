@@ -10,19 +10,17 @@ pixel is an *edge*, and is drawn with samples of its own.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
-from ..kernels.arrays import F64_1D, F64_2D, I32_1D, I64_1D
+from ..kernels.arrays import I64_1D
 from ..kernels.compile import flag, inlined, kernel
 from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, put
 from ..kernels.sampling import Key
 from ..kernels.vec import Vec, add, dot, length, lerp, mul, normalize, row, scale, sub
-from ..view.camera import Tile, View, pixel_point, pixel_ray
-from ..view.gbuffer import OpaqueLayer, add_view_ray
+from ..view.camera import Tile, View, pixel_ray
+from ..view.gbuffer import OpaqueLayer
 from ..view.planes import Planes
-from ..world.embree import COHERENT, EVERYTHING, clear, has_hit
 from ..world.shading import entering, is_painted_alone, load_surface, paint
 from ..world.surface import (
     NOTHING,
@@ -30,26 +28,24 @@ from ..world.surface import (
     Interaction,
     Ray,
     corners_of,
-    hit_in,
     interaction,
     is_round,
     kept_hit,
     surface_of,
 )
 from ..world.tables import World
-from ..world.tracing import intersect_world
 from .answers import MOST_ANSWERS, Answers, add_direct, add_sky, body_light, keep_answers
+from .behind import EDGE, OPEN
+from .between import THIN, look_between
 from .crossing import Rules
-from .pixels import add_glass, add_light, keep_glass, keep_place
+from .edges import draw_edges, expected_error, set_for
+from .patch import PATCH, ROW, CornerScratch, Refining, Ways, corner
+from .pixels import add_glass, keep_glass
 from .rays import MIRRORED_SIDE, THROUGH_SIDE, VIEW, Rays
 from .tiers import Asking
-from .tree import CELL, SLOTS, Cell, TreeScratch, clear_slot, follow, start
+from .tree import CELL, TreeScratch, clear_slot, follow, start
 
-PATCH = 32
-"""Pixels along the side of a patch, a tile that is done at once."""
-_ROW = PATCH + 1
-"""Corners along it."""
-_GLASS_ONLY, _ALL = flag(False), flag(True)
+_GLASS_ONLY = flag(False)
 _ALIKE = 0.9
 """Cosine of the normals of a surface above which neighbours may see the same side of it."""
 _SAME_WAY = 0.98
@@ -57,77 +53,12 @@ _SAME_WAY = 0.98
 _SMOOTH = 5.0
 """Times the tolerance that light may change along a surface that all corners see: there a mean is exact to the second
 order."""
-_PER_TOLERANCE = 0.8
-"""Samples, to the power of 3/4, for each tolerance that corners differ by."""
 _PAINTED = 0.2
 """Times the tolerance, below which a texture is not looked at between the corners."""
 _FAR_APART = 2.5
 """Times the width that corners look at, from which on what lies between them is looked at whatever they say."""
-_ALL_SAMPLES = 2
-"""The set of samples of a pixel that takes all."""
-_EDGE_ON = 0.1
-"""Cosine below which a surface is seen too slantingly to say where it is elsewhere."""
 _MOST_TAPS = 8
 """Along each side of a quadrilateral."""
-
-
-class Refining(NamedTuple):
-    """Which pixels are drawn with samples of their own, and with which."""
-
-    tolerance: float
-    """largest difference between corners that is passed, of the square root of light; above 1, of half its logarithm"""
-    exposure: float
-    """of the picture: what light is multiplied with before it is looked at"""
-    offsets: F64_2D
-    """shape (S, 2): of the samples, from the pixel's middle [pixels]: few, more and most of them, set after set"""
-    sets: I64_1D
-    """shape (4,): where in `offsets` each set begins, and the last one ends"""
-    samples: int
-    """by which `planes` will be divided"""
-    corner_rays: int
-    """to each light and to the sky, from strong leaves of a corner"""
-    sample_rays: int
-    """the same, of a sample at an edge"""
-
-
-class CornerScratch(NamedTuple):
-    """What one thread needs besides a tree's."""
-
-    middle: I32_1D
-    """surface that is seen in the middle of each pixel of the patch; NOTHING where there is none"""
-    edges: I32_1D
-    """pixels of the patch that are edges"""
-    sets: I32_1D
-    """which samples each of them takes"""
-    contrast: F64_1D
-    """of its corners"""
-    places: I32_1D
-    """row of `Refining.offsets` of each slot"""
-    times: F64_1D
-    """for how many samples each slot stands"""
-    found: I64_1D
-    """shape (4,): the rows of four answers that match"""
-    used: I64_1D
-    """shape (4,): bits of the answers that have found their like, corner by corner"""
-    filtered: F64_2D
-    """shape (2, 3): emission and albedo over a pixel"""
-    alone: F64_2D
-    """shape (4, 3): light that each corner alone has"""
-    shared: F64_2D
-    """shape (4, 3): light that all have, without what textures do to it"""
-    light: F64_2D
-    """shape (3, 3): what the pixel gets, by the side of the leaves"""
-
-    @staticmethod
-    def fresh() -> CornerScratch:
-        """All of it at zero."""
-        return CornerScratch(
-            np.zeros(PATCH * PATCH, np.int32), np.zeros(PATCH * PATCH, np.int32), np.zeros(PATCH * PATCH, np.int32),
-            np.zeros(PATCH * PATCH),
-            np.zeros(CELL, np.int32), np.zeros(CELL),
-            np.zeros(4, np.int64), np.zeros(4, np.int64),
-            np.zeros((2, 3)), np.zeros((4, 3)), np.zeros((4, 3)), np.zeros((3, 3)),
-        )  # fmt: skip
 
 
 # --- a patch ------------------------------------------------------------------------------------------------------
@@ -146,6 +77,7 @@ def corner_tile(
     view: View,
     opaque: OpaqueLayer,
     planes: Planes,
+    ways: Ways,
 ) -> int:
     """Draw a patch: `planes` get as much as they would from all samples. What is added up in which order hangs on the
     patch, so the picture is cut into patches in one way only.
@@ -154,6 +86,7 @@ def corner_tile(
         asking: its screen shows the corners.
         view: of the pixels.
         opaque: the corners' opaque picture, with hits.
+        ways: filled for the patch.
 
     Returns:
         Rays traced.
@@ -166,18 +99,22 @@ def corner_tile(
         scratch, world, asking, rules, view_ray, opaque, x0, y0, width + 1, height + 1, refining.corner_rays
     )
     keep_answers(scratch.answers, False)
-    _look_in_middles(scratch, own, world, view, x0, y0, width, height)
+    for j in range(height + 1):
+        for i in range(width + 1):
+            ways.at[y0 + j, x0 + i] = scratch.cell.ways[j * ROW + i]
+    look_between(scratch, own, world, refining, view, x0, y0, width, height)
     edges = 0
     for j in range(height):
         for i in range(width):
             contrast = math.inf
-            if not _is_between(scratch, own.middle[j * PATCH + i], j * _ROW + i):
-                contrast = _draw_pixel(scratch, own, world, refining, view, planes, x0 + i, y0 + j, j * _ROW + i)
+            if own.thin[j * PATCH + i] != THIN:
+                contrast = _draw_pixel(scratch, own, world, refining, view, planes, x0 + i, y0 + j, j * ROW + i)
+            ways.state[y0 + j, x0 + i] = EDGE if contrast > refining.tolerance else OPEN
             if contrast > refining.tolerance:
-                own.edges[edges], own.sets[edges] = j * PATCH + i, _set_for(refining, contrast)
+                own.edges[edges], own.sets[edges] = (y0 + j) * view.size[0] + x0 + i, set_for(refining, contrast)
                 own.contrast[edges] = contrast if contrast < math.inf else 1.0
                 edges += 1
-    _draw_edges(scratch, own, world, asking, rules, view_ray, refining, view, planes, x0, y0, edges)
+    draw_edges(scratch, own, world, asking, rules, view_ray, refining, view, planes, edges)
     return scratch.packet.tally[0] + scratch.work.packet.tally[0]
 
 
@@ -196,7 +133,7 @@ def _draw_corners(
                 i, j = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
                 if i >= columns or j >= rows:
                     continue
-                x, y, slot = x0 + i, y0 + j, j * _ROW + i
+                x, y, slot = x0 + i, y0 + j, j * ROW + i
                 scratch.answers.filled[slot] = 0
                 if opaque.glass[y, x] == 0 and not submerged:
                     _keep_opaque(scratch, world, view, opaque, x, y, slot)
@@ -210,11 +147,12 @@ def _draw_corners(
         follow(scratch, world, asking, rules, view, count, _GLASS_ONLY, times)
     for j in range(rows):
         for i in range(columns):
-            slot = j * _ROW + i
+            slot = j * ROW + i
             if scratch.answers.filled[slot] == 0 and scratch.cell.glass[slot] == 0:  # it passed what glass it met
-                first = scratch.cell.part[slot]
+                first, facing = scratch.cell.part[slot], row(scratch.cell.facing, slot)
                 _keep_opaque(scratch, world, view, opaque, x0 + i, y0 + j, slot)
                 scratch.cell.part[slot] = first
+                put(scratch.cell.facing, slot, facing)
 
 
 @inlined
@@ -232,6 +170,7 @@ def _keep_opaque(
     cell.part[slot] = NOTHING
     cell.z_depth[slot] = opaque.depth[y, x]
     put(cell.normal, slot, row(opaque.normal[y], x))
+    put(cell.facing, slot, row(opaque.normal[y], x))
     if opaque.depth[y, x] == math.inf:
         add_sky(scratch.answers, slot, direction, light)
         return
@@ -248,35 +187,6 @@ def _keep_opaque(
     add_direct(scratch.answers, slot, world, at, direction, emissive, albedo, irradiance, gloss, view.spread * t)
 
 
-@inlined
-def _look_in_middles(
-    scratch: TreeScratch, own: CornerScratch, world: World, view: View, x0: int, y0: int, width: int, height: int
-) -> None:
-    """Find out which parts are seen in the middles of a patch's pixels: what is thin may pass between all corners."""
-    packet = scratch.packet
-    for by in range(0, height, BLOCK_HEIGHT):
-        for bx in range(0, width, BLOCK_WIDTH):
-            clear(packet)
-            for lane in range(LANES):
-                i, j = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
-                if i < width and j < height:
-                    own.middle[j * PATCH + i] = NOTHING
-                    scratch.far[lane] = add_view_ray(packet, view, lane, x0 + i, y0 + j, EVERYTHING)
-            intersect_world(packet, world, scratch.far, COHERENT)
-            for lane in range(LANES):
-                if has_hit(packet, lane):
-                    i, j = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
-                    own.middle[j * PATCH + i] = surface_of(world.geometry, hit_in(packet, lane, world.geometry))
-
-
-@inlined
-def _is_between(scratch: TreeScratch, part: int, slot: int) -> bool:
-    """What the middle of a pixel shows is seen in none of its corners."""
-    seen = scratch.cell.part
-    first_two = seen[_corner(slot, 0)] == part or seen[_corner(slot, 1)] == part
-    return not (first_two or seen[_corner(slot, 2)] == part or seen[_corner(slot, 3)] == part)
-
-
 # --- a pixel ------------------------------------------------------------------------------------------------------
 
 
@@ -288,7 +198,7 @@ def _draw_pixel(
     """Make a pixel of its corners, and return their contrast; where it is over the tolerance nothing is done."""
     answers = scratch.answers
     for k in range(4):
-        if answers.filled[_corner(slot, k)] > MOST_ANSWERS:
+        if answers.filled[corner(slot, k)] > MOST_ANSWERS:
             return math.inf
         own.used[k] = 0
         for c in range(3):
@@ -297,7 +207,7 @@ def _draw_pixel(
         put(own.light, side, (0.0, 0.0, 0.0))
     seen = (0.0, 0.0, 0.0)
     for k in range(4):
-        seen = add(seen, scale(row(scratch.cell.color, _corner(slot, k)), 0.25))
+        seen = add(seen, scale(row(scratch.cell.color, corner(slot, k)), 0.25))
     for n in range(answers.filled[slot]):
         r = slot * MOST_ANSWERS + n
         if not _match(answers, own, slot, r):
@@ -305,8 +215,8 @@ def _draw_pixel(
         light = _light_of_four(scratch, own, world, refining, seen)
         put(own.light, answers.side[r], add(row(own.light, answers.side[r]), light))
     for k in range(4):
-        base = _corner(slot, k) * MOST_ANSWERS
-        for n in range(answers.filled[_corner(slot, k)]):
+        base = corner(slot, k) * MOST_ANSWERS
+        for n in range(answers.filled[corner(slot, k)]):
             if (own.used[k] >> n) & 1 != 0:
                 continue
             r = base + n
@@ -317,14 +227,8 @@ def _draw_pixel(
     contrast = _contrast(scratch, own, refining, slot)
     if contrast <= refining.tolerance:
         _write_pixel(scratch, own, planes, refining.samples, x, y, slot, view.orthographic)
-        planes.confidence[y, x] *= 1.0 - min(1.0, _expected_error(contrast, 4))
+        planes.confidence[y, x] *= 1.0 - min(1.0, expected_error(contrast, 4))
     return contrast
-
-
-@inlined
-def _corner(slot: int, k: int) -> int:
-    """The slot of corner `k` of the pixel whose first corner is `slot`: along x first."""
-    return slot + k % 2 + k // 2 * _ROW
 
 
 @inlined
@@ -332,16 +236,16 @@ def _match(answers: Answers, own: CornerScratch, slot: int, r: int) -> bool:
     """Whether the other corners have an answer like row `r` of the first; if so, all four are noted, and used up."""
     own.found[0] = r
     for k in range(1, 4):
-        base = _corner(slot, k) * MOST_ANSWERS
+        base = corner(slot, k) * MOST_ANSWERS
         found = -1
-        for n in range(answers.filled[_corner(slot, k)]):
+        for n in range(answers.filled[corner(slot, k)]):
             if found < 0 and (own.used[k] >> n) & 1 == 0 and _alike(answers, r, base + n):
                 found = base + n
         if found < 0:
             return False
         own.found[k] = found
     for k in range(4):
-        own.used[k] |= 1 << (own.found[k] - _corner(slot, k) * MOST_ANSWERS)
+        own.used[k] |= 1 << (own.found[k] - corner(slot, k) * MOST_ANSWERS)
     return True
 
 
@@ -494,30 +398,11 @@ def _contrast(scratch: TreeScratch, own: CornerScratch, refining: Refining, slot
     cell = scratch.cell
     least, all_missing = math.inf, -math.inf
     for k in range(4):
-        if cell.chance[_corner(slot, k)] != 0:  # that four agree says nothing
+        if cell.chance[corner(slot, k)] != 0:  # that four agree says nothing
             return 1.0
-        missing = cell.missing[_corner(slot, k)]
+        missing = cell.missing[corner(slot, k)]
         least, all_missing = min(least, missing), max(all_missing, missing)
     return max(most, all_missing - least)
-
-
-@inlined
-def _expected_error(contrast: float, samples: int) -> float:
-    """By how much a pixel is off, to the eye, that is made of so many samples or corners.
-
-    The error of n samples spread evenly over a pixel that an edge cuts falls with n^(3/4) (Mitchell, "Consequences of
-    stratified sampling in graphics", SIGGRAPH 1996).
-    """
-    return _PER_TOLERANCE * contrast / samples**0.75
-
-
-@inlined
-def _set_for(refining: Refining, contrast: float) -> int:
-    """The smallest set of samples that is enough for an edge of this contrast."""
-    for k in range(_ALL_SAMPLES):
-        if _expected_error(contrast, refining.sets[k + 1] - refining.sets[k]) <= refining.tolerance:
-            return k
-    return _ALL_SAMPLES
 
 
 @inlined
@@ -530,7 +415,7 @@ def _write_pixel(
     nearness, z, normal, missing = 0.0, 0.0, (0.0, 0.0, 0.0), 0.0
     glass = -1
     for k in range(4):
-        i = _corner(slot, k)
+        i = corner(slot, k)
         z += 0.25 * cell.z_depth[i]
         nearness += 0.25 / cell.z_depth[i]
         normal = add(normal, row(cell.normal, i))
@@ -553,70 +438,3 @@ def _write_pixel(
     planes.z_depth[y, x] = z if orthographic or nearness == 0.0 else 1.0 / nearness
     for c in range(3):
         planes.normal[y, x, c] = normal[c]
-
-
-# --- edges --------------------------------------------------------------------------------------------------------
-
-
-@inlined
-def _draw_edges(
-    scratch: TreeScratch, own: CornerScratch, world: World, asking: Asking, rules: Rules, view_ray: Rays,
-    refining: Refining, view: View, planes: Planes, x0: int, y0: int, edges: int,
-) -> None:  # fmt: skip
-    """Draw the pixels of a patch that its corners do not tell, all samples of one after the other."""
-    count = 0
-    for k in range(edges):
-        pixel, first, end = own.edges[k], refining.sets[own.sets[k]], refining.sets[own.sets[k] + 1]
-        x, y = x0 + pixel % PATCH, y0 + pixel // PATCH
-        for place in range(first, end):
-            own.places[count], own.times[count] = place, refining.samples / (end - first)
-            px, py = x + 0.5 + refining.offsets[place, 0], y + 0.5 + refining.offsets[place, 1]
-            scratch.cell.spread[count] = view.spread / math.sqrt(refining.samples)
-            count = start(scratch, view, view_ray, count, count, px, py, Key(x, y, 0, place - first))
-            if count == CELL:
-                _draw_samples(scratch, own, world, asking, rules, refining, view, planes, count)
-                count = 0
-    if count > 0:
-        _draw_samples(scratch, own, world, asking, rules, refining, view, planes, count)
-    for k in range(edges):
-        taken = refining.sets[own.sets[k] + 1] - refining.sets[own.sets[k]]
-        x, y = x0 + own.edges[k] % PATCH, y0 + own.edges[k] // PATCH
-        planes.confidence[y, x] *= 1.0 - min(1.0, _expected_error(own.contrast[k], taken))
-
-
-@inlined
-def _depth_in_middle(view: View, cell: Cell, slot: int, px: float, py: float, dx: float, dy: float) -> float:
-    """z_depth in the middle of a pixel of the surface that a sample beside it has met, as if it were flat [m]."""
-    z = cell.z_depth[slot]
-    if z == math.inf:
-        return z
-    point, normal = pixel_point(view, px + dx, py + dy, z), row(cell.normal, slot)
-    origin, direction, cosine = pixel_ray(view, px, py)
-    facing = dot(direction, normal)
-    if abs(facing) < _EDGE_ON:
-        return z
-    return dot(sub(point, origin), normal) / facing * cosine
-
-
-@inlined
-def _draw_samples(
-    scratch: TreeScratch, own: CornerScratch, world: World, asking: Asking, rules: Rules, refining: Refining,
-    view: View, planes: Planes, count: int,
-) -> None:  # fmt: skip
-    """Follow the samples on the stack, and add them to their pixels."""
-    follow(scratch, world, asking, rules, view, count, _ALL, refining.sample_rays)
-    cell = scratch.cell
-    for slot in range(count):
-        x, y = cell.x[slot], cell.y[slot]
-        add_light(planes, cell, slot, x, y, own.times[slot])
-        if cell.glass[slot] != 0:
-            add_glass(planes, cell, slot, x, y, own.times[slot])
-        if cell.sample[slot] == 0:
-            offset = refining.offsets[own.places[slot]]
-            cell.z_depth[slot] = _depth_in_middle(view, cell, slot, x + 0.5, y + 0.5, offset[0], offset[1])
-            keep_place(planes, cell, slot, x, y)
-            if cell.glass[slot] != 0:
-                keep_glass(planes, cell, slot, x, y)
-
-
-assert SLOTS == _ROW * _ROW

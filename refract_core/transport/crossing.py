@@ -349,6 +349,7 @@ def send_mirrored(to: Rays, i: int, now: Rays, lane: int, meeting: Meeting) -> i
     put(to.clear, i, row(meeting.mirrored_clear, lane))
     to.blur[i] = math.hypot(now.blur[lane], _tan_of_lobe(meeting.roughness[lane]))
     to.lamps[i] = 1 if meeting.kind[lane] == LEFT else 0
+    to.mirrored[i] = 1
     if now.side[lane] == VIEW:
         to.side[i] = MIRRORED_SIDE
     return i + 1

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from ..models import BY_TOKEN, Behind
 from ..scene import Camera, Material, Mesh, Param, Scene
-from ..world.instances import around as around_places
-from ..world.instances import placed
+from ..world.instances import around, numbered, placed
 from ..world.solid import encloses
 from .rays import MOST_MEDIA, Rays, add_medium, ray_in_air
 
@@ -30,28 +29,24 @@ def view_ray(scene: Scene, camera: Camera, model: str) -> Rays:
         return ray
     eye = camera.world_from_camera[:3, 3]
     traced = np.array([_is_traced(material, model) for material in scene.materials], np.bool_)
-    around: list[tuple[float, int, Material]] = []
+    bodies: list[tuple[float, int, Material]] = []
     for thing, mesh in enumerate(scene.meshes):
         filling = _filling(mesh, traced)
         if filling >= 0 and encloses(mesh.points, mesh.triangles, eye):
-            around.append((float(np.prod(np.ptp(mesh.points, axis=0))), thing, scene.materials[filling]))
+            bodies.append((float(np.prod(np.ptp(mesh.points, axis=0))), thing, scene.materials[filling]))
     for k, ball in enumerate(scene.spheres):
         if traced[ball.material] and math.dist(ball.centre, eye) < ball.radius:
-            around.append(((2.0 * ball.radius) ** 3, len(scene.meshes) + k, scene.materials[ball.material]))
-    first = len(scene.meshes) + len(scene.spheres)
-    for many in scene.instances:
+            bodies.append(((2.0 * ball.radius) ** 3, len(scene.meshes) + k, scene.materials[ball.material]))
+    instances, clouds = numbered(scene)
+    for first, many in instances:
         filling = _filling(many.mesh, traced)
-        for k in around_places(many, eye) if filling >= 0 else ():
+        for k in around(many, eye) if filling >= 0 else ():
             size = float(np.prod(np.ptp(placed(many, k).points, axis=0)))
-            around.append((size, first + k, scene.materials[filling]))
-        first += len(many)
-    for balls in scene.balls:
-        if traced[balls.material]:
-            inside = np.linalg.norm(balls.centres.astype(np.float64) - eye, axis=1) < balls.radii
-            for k in np.flatnonzero(inside).tolist():
-                around.append(((2.0 * float(balls.radii[k])) ** 3, first + k, scene.materials[balls.material]))
-        first += len(balls)
-    for _, thing, material in sorted(around, key=lambda body: -body[0])[-MOST_MEDIA:]:
+            bodies.append((size, first + k, scene.materials[filling]))
+    for first, balls in clouds:
+        for k in around(balls, eye) if traced[balls.material] else ():
+            bodies.append(((2.0 * float(balls.radii[k])) ** 3, first + k, scene.materials[balls.material]))
+    for _, thing, material in sorted(bodies, key=lambda body: -body[0])[-MOST_MEDIA:]:
         r, g, b = (float(c) for c in material.inputs[Param.TRANSMITTANCE].value[:3])
         ior = max(1.0, float(material.inputs[Param.IOR].value[0]))
         ray.thing[:] = thing

@@ -96,6 +96,17 @@ def _add_cell(planes: Planes, cell: Cell, opaque: OpaqueLayer, view: View, x0: i
 
 
 @inlined
+def forget_pixel(planes: Planes, x: int, y: int) -> None:
+    """Nothing is known of a pixel yet."""
+    for c in range(3):
+        planes.beauty[y, x, c] = planes.refraction[y, x, c] = planes.reflection[y, x, c] = 0.0
+        planes.transmittance[y, x, c] = planes.normal[y, x, c] = 0.0
+    planes.beauty[y, x, 3] = planes.mask[y, x] = planes.confidence[y, x] = 0.0
+    planes.screen[y, x] = planes.ray[y, x] = planes.probe[y, x] = planes.sky[y, x] = planes.none[y, x] = 0.0
+    planes.z_depth[y, x] = planes.thickness[y, x] = planes.path_length[y, x] = planes.layers[y, x] = 0.0
+
+
+@inlined
 def add_light(planes: Planes, cell: Cell, i: int, x: int, y: int, times: float) -> None:
     """Add what a view ray has seen to a pixel, `times` over."""
     for c in range(3):

@@ -102,6 +102,8 @@ class Rays(NamedTuple):
     lamps: I32_1D
     """1 where it sees lamps: it has been mirrored inside of glass, and since then by no outside, whose highlights are
     the lamps' mirror pictures already"""
+    mirrored: I32_1D
+    """1 where any surface has mirrored it"""
     media: Media
 
 
@@ -153,6 +155,7 @@ def copy_ray(to: Rays, i: int, rays: Rays, j: int) -> None:
     to.way[i] = rays.way[j]
     to.channel[i], to.side[i], to.thing[i] = rays.channel[j], rays.side[j], rays.thing[j]
     to.entered[i], to.met[i], to.lamps[i] = rays.entered[j], rays.met[j], rays.lamps[j]
+    to.mirrored[i] = rays.mirrored[j]
     to.media.depth[i] = rays.media.depth[j]
     for k in range(rays.media.depth[j]):
         _copy_medium(to.media, i, k, rays.media, j, k)

@@ -26,7 +26,7 @@ from ..view.camera import PixelPoint
 from ..view.pyramid import Screen
 from ..view.screen import light_seen, screen_blurred, screen_march, screen_proxy
 from ..world.embree import OPAQUE, SCATTERED, Packet, clear, set_ray
-from ..world.environment import prefiltered
+from ..world.environment import background, prefiltered
 from ..world.shading import Block, gloss, load_hits, load_surface, nth, shade
 from ..world.surface import NOTHING, HitLanes, Ray, interaction, kept_hit
 from ..world.tables import World
@@ -68,6 +68,8 @@ class Query(NamedTuple):
     """1: the ray is inside a medium, and meets an opaque object there; or it is a view ray"""
     direct: Flags
     """1: it is a view ray that has met no glass"""
+    through: Flags
+    """1: what it sees past everything is what a picture's background is, not the dome as lamps and mirrors know it"""
     strong: Flags
     """1: much of its pixel's light comes this way, so that a ray of its own is worth its price"""
     rays: Words
@@ -201,6 +203,10 @@ def ask(query: Query, asking: Asking, work: TierScratch, world: World) -> None:
                 lobe = query.roughness[lane]
                 if query.by_proxy[lane] == 0:
                     lobe = math.sqrt(min(1.0, 0.5 * query.blur[lane]))
+                if world.environment.hidden and query.through[lane] != 0:
+                    light, covered = background(world.environment, row(query.direction, lane))
+                    _add_covered(query, lane, SKY, light, covered, _headroom(query, lane), 1.0)
+                    continue
                 light = prefiltered(world.environment, row(query.direction, lane), lobe)
                 _add(query, lane, SKY, light, _headroom(query, lane), 1.0)
 

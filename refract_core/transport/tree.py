@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..kernels.arrays import F64_1D, F64_2D, I32_1D
+from ..kernels.arrays import F64_1D, F64_2D, I32_1D, I64_1D
 from ..kernels.compile import inlined
 from ..kernels.lanes import LANES, Flags, Scalars, new_lanes, put
 from ..kernels.sampling import Key, set_key
@@ -21,7 +21,7 @@ from ..kernels.vec import Vec, add, along, dot, flip_towards, mul, row, scale
 from ..scene import Model
 from ..view.camera import View, pixel_ray
 from ..world.embree import COHERENT, EVERYTHING, OPAQUE, SCATTERED, Packet, clear, has_hit, set_ray
-from ..world.environment import TEXEL_LUMINANCE, radiance
+from ..world.environment import TEXEL_LUMINANCE, background
 from ..world.lights import lamp_ahead
 from ..world.offsets import tie
 from ..world.shading import LOBES, Block, gather, load_surface
@@ -29,7 +29,7 @@ from ..world.shaping import shape_drawn
 from ..world.surface import NOTHING, Hit, HitLanes, Ray, hit_in, interaction, keep_hit, kept_hit, surface_of
 from ..world.tables import World
 from ..world.tracing import belongs_to, intersect_world
-from .answers import Answers, add_answer, add_glow, new_answers
+from .answers import Answers, add_answer, add_glow, new_answers, way_to
 from .crossing import (
     LEFT,
     PASSED,
@@ -51,7 +51,7 @@ CELL = 64
 # happens once on a way. It does so at most as often as rays may meet glass, which bounds the stack.
 _STACK = CELL + 4 * LANES * (MOST_MET + 2)
 SLOTS = 33 * 33
-"""As many as a patch of 32x32 pixels has corners."""
+"""As many as a patch of 32x32 pixels has corners. Behind them a cell has slots for samples."""
 _LEAVES = 256
 _STRONG = 0.1
 """Weight of a leaf above which its light is worth rays of its own."""
@@ -101,6 +101,10 @@ class Cell(NamedTuple):
     """1 where something that one of its rays met is there by chance, or is not"""
     part: I32_1D
     """of the first surface, glass or not; NOTHING where there is none"""
+    facing: F64_2D
+    """shape (N, 3): its unit geometric normal"""
+    ways: I64_1D
+    """by which strong leaves behind glass came, and what they met: two of 64 bits for each"""
     z_depth: F64_1D
     """of the first surface [m]"""
     normal: F64_2D
@@ -143,17 +147,20 @@ class TreeScratch(NamedTuple):
         return TreeScratch(
             new_lanes(TierScratch), new_lanes(Packet), new_lanes(Block), new_lanes(Meeting), new_lanes(HitLanes),
             np.zeros(LANES, np.int32), np.zeros(LANES), new_lanes(Query), new_rays(LANES), new_rays(_STACK),
-            new_rays(_LEAVES), HitLanes(*(np.zeros(_LEAVES, kind) for kind in kinds)), _new_cell(SLOTS),
+            new_rays(_LEAVES), HitLanes(*(np.zeros(_LEAVES, kind) for kind in kinds)), _new_cell(SLOTS + CELL),
             new_answers(SLOTS), new_lanes(Block),
         )  # fmt: skip
 
 
 def _new_cell(count: int) -> Cell:
-    columns = {"color": 3, "refraction": 3, "reflection": 3, "weight": 3, "clear": 3, "tiers": 5, "normal": 3}
+    vectors = ("color", "refraction", "reflection", "weight", "clear", "facing", "normal")
+    columns = dict.fromkeys(vectors, 3) | {"tiers": 5}
 
     def array(name: str) -> Any:
         if name in ("x", "y", "sample", "entered", "glass", "chance", "part"):
             return np.zeros(count, np.int32)
+        if name == "ways":
+            return np.zeros(count, np.int64)
         return np.zeros((count, columns[name])) if name in columns else np.zeros(count)
 
     return Cell(*(array(name) for name in Cell._fields))
@@ -199,6 +206,7 @@ def clear_slot(cell: Cell, i: int) -> None:
         cell.tiers[i, k] = 0.0
     cell.missing[i] = cell.confidence[i] = cell.share[i] = cell.largest[i] = cell.path[i] = 0.0
     cell.entered[i] = cell.glass[i] = cell.chance[i] = 0
+    cell.ways[i] = 0
     cell.part[i] = NOTHING
     cell.z_depth[i] = math.inf
     cell.thickness[i] = 0.0
@@ -324,10 +332,11 @@ def _meet_all(scratch: TreeScratch, world: World, view: View, rules: Rules, take
             continue
         first = now.side[lane] == VIEW
         direction = row(now.direction, lane)
-        if first and now.met[lane] == 0:  # even what it passes: the ray to the pixel's middle sees that, too
-            cell.part[now.pixel[lane]] = surface_of(world.geometry, hit)
         wide = cell.spread[now.pixel[lane]] * (now.travelled[lane] + hit.t)
         at = interaction(world.geometry, hit, Ray(row(now.origin, lane), direction), wide)
+        if first and now.met[lane] == 0:  # even what it passes: the ray to the pixel's middle sees that, too
+            cell.part[now.pixel[lane]] = surface_of(world.geometry, hit)
+            put(cell.facing, now.pixel[lane], at.ng)
         meet(meeting, lane, now, at, world)
         scratch.state[lane] = _MET
         if meeting.kind[lane] == PASSED:
@@ -375,10 +384,11 @@ def _note_opaque(scratch: TreeScratch, world: World, view: View, lane: int) -> N
     """Where a view ray ends without having met any interface."""
     now, hit = scratch.now, kept_hit(scratch.met, lane)
     direction, i = row(now.direction, lane), now.pixel[lane]
-    if now.met[lane] == 0:
-        scratch.cell.part[i] = surface_of(world.geometry, hit)
     scratch.cell.z_depth[i] = hit.t * dot(direction, row(view.axes, 2))
     at = interaction(world.geometry, hit, Ray(row(now.origin, lane), direction), 0.0)
+    if now.met[lane] == 0:
+        scratch.cell.part[i] = surface_of(world.geometry, hit)
+        put(scratch.cell.facing, i, at.ng)
     put(scratch.cell.normal, i, flip_towards(at.ng, scale(direction, -1.0)))
 
 
@@ -484,6 +494,9 @@ def _load_query(
     query.thing[lane] = leaves.thing[k]
     query.width[lane] = cell.spread[i] * (leaves.travelled[k] + scratch.leaf_hits.t[k])
     keep_hit(query.met, lane, kept_hit(scratch.leaf_hits, k))
+    # A ray that nothing has mirrored and that still goes ahead sees, through the glass, what is behind it.
+    ahead = dot(row(leaves.direction, k), row(view.axes, 2)) > 0.0
+    query.through[lane] = 1 if ahead and leaves.mirrored[k] == 0 else 0
     inside = leaves.media.depth[k] > 0 and seen
     query.direct[lane] = 1 if direct else 0
     query.embedded[lane] = 1 if inside or direct else 0
@@ -499,9 +512,15 @@ def _load_query(
 @inlined
 def _add_background(cell: Cell, i: int, world: World, direction: Vec) -> None:
     """The sky as a view ray sees it, or nothing."""
-    cell.missing[i] = 0.0 if world.environment.present else 1.0
-    if world.environment.present:
-        put(cell.color, i, add(row(cell.color, i), radiance(world.environment, direction, 0.0)))
+    sky, covered = background(world.environment, direction)
+    cell.missing[i] = 1.0 - covered
+    put(cell.color, i, add(row(cell.color, i), sky))
+
+
+@inlined
+def _bits_of(way: int) -> int:
+    """Two bits of 64 that stand for a way."""
+    return int((np.int64(1) << np.int64(way & 63)) | (np.int64(1) << np.int64((way >> 6) & 63)))
 
 
 @inlined
@@ -525,6 +544,8 @@ def _add_leaf(scratch: TreeScratch, world: World, k: int, lane: int, view: View)
     if dot(row(leaves.direction, k), row(view.axes, 2)) > 0.0:  # it would have seen a background
         cell.missing[i] += mean * unanswered
     add_answer(scratch.answers, i, leaves, k, query, lane, world)
+    if share > _STRONG and cell.glass[i] != 0 and leaves.blur[k] <= 0.0:
+        cell.ways[i] |= _bits_of(way_to(leaves, k, query, lane, world))
     if leaves.side[k] == MIRRORED_SIDE:
         return
     for tier in range(4):

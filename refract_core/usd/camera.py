@@ -11,22 +11,15 @@ from pxr import Gf, Usd, UsdGeom, UsdRender
 
 from ..errors import UsageError
 from ..scene import F64, Camera, Notice
+from ..view.orbit import APERTURE, FOCAL_LENGTH, Bounds, see_everything
+from .settings import authored_value
 from .values import numbers
 
-Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
-"""Lowest and highest corner [m], engine world."""
-FOCAL_LENGTH = 50.0
-APERTURE = (20.955, 15.2908)
-"""Horizontal and vertical [tenths of a scene unit]; fallbacks of UsdGeomCamera."""
 MAIN_CAMERA = "main_cam"
 _TENTH = 0.1
 """Scene units of what a UsdGeomCamera's lens and film are measured in."""
 _SAVED_FOCAL_LENGTH = 18.147562
 """Of the view that Omniverse's applications open a stage with, over the same aperture."""
-_FLAT = 0.02
-"""Of its largest side: under it bounds are flat along an axis, and seen from there are a line."""
-_AIR = 1.1
-"""How much farther than need be the camera stands that is made for a stage without one."""
 
 
 def read_cameras(
@@ -97,15 +90,13 @@ def _read(
 def _lens(
     camera: UsdGeom.Camera, time: Usd.TimeCode, orthographic: bool, focal: float, metres_per_unit: float,
     notices: list[Notice],
-) -> dict[str, float]:  # fmt: skip
+) -> dict[str, Any]:  # fmt: skip
     """Radius and focus of the lens, for a `Camera`; nothing where everything is in focus.
 
     Source: UsdGeomCamera, where fStop 0 turns it off, and apertures are focalLength / fStop wide.
     """
     stops = _finite(camera.GetFStopAttr(), time, 0.0, notices)
-    settings = UsdRender.Settings.GetStageRenderSettings(camera.GetPrim().GetStage())
-    off = settings and settings.GetDisableDepthOfFieldAttr().Get(Usd.TimeCode.EarliestTime())
-    if stops <= 0.0 or off:
+    if stops <= 0.0 or _switched_off(camera, "disableDepthOfField"):
         return {}
     focus = _finite(camera.GetFocusDistanceAttr(), time, 0.0, notices)
     if focus > 0.0 and not orthographic:
@@ -115,6 +106,12 @@ def _lens(
     text = f"fStop is {stops:g}, but {why}; everything is in focus"
     notices.append(Notice(str(camera.GetPath()), text))
     return {}
+
+
+def _switched_off(camera: UsdGeom.Camera, name: str) -> bool:
+    """Whether the stage's render settings say so by an attribute."""
+    settings = UsdRender.Settings.GetStageRenderSettings(camera.GetPrim().GetStage())
+    return bool(settings and authored_value(settings.GetPrim(), name))
 
 
 def _rigid(matrix: Gf.Matrix4d, engine_from_stage: F64) -> F64 | None:
@@ -178,6 +175,7 @@ def choose_camera(
     bounds: Bounds,
     *,
     moving: bool,
+    orbits: bool,
     engine_from_stage: F64,
     metres_per_unit: float,
     notices: list[Notice],
@@ -190,10 +188,13 @@ def choose_camera(
 
     Args:
         moving: something that is drawn varies in time
+        orbits: the picture is taken by a camera of its own, so nothing is said of one that nobody asked for
 
     Raises:
         UsageError: where `wanted` is no camera of the stage.
     """
+    if orbits and not wanted:
+        notices = []
     chosen = _choose(stage, cameras, wanted, notices)
     if chosen is None:
         saved = _saved_view(stage, bounds, engine_from_stage, metres_per_unit, notices)
@@ -211,9 +212,7 @@ def choose_camera(
 def _frozen(camera: UsdGeom.Camera, time: Usd.TimeCode, moving: bool) -> Iterator[Notice]:
     """Says that a shutter stays open while things move, which is not drawn."""
     opens, closes = (attribute.Get(time) for attribute in (camera.GetShutterOpenAttr(), camera.GetShutterCloseAttr()))
-    settings = UsdRender.Settings.GetStageRenderSettings(camera.GetPrim().GetStage())
-    off = settings and settings.GetDisableMotionBlurAttr().Get(Usd.TimeCode.EarliestTime())
-    if off or opens == closes or not (moving or _moves(camera.GetPrim())):
+    if opens == closes or not (moving or _moves(camera.GetPrim())) or _switched_off(camera, "disableMotionBlur"):
         return
     text = f"its shutter is open from {opens:g} to {closes:g} while things move, but motion blur is not drawn: "
     yield Notice(str(camera.GetPath()), text + "everything stands still at the time of the frame")
@@ -310,41 +309,3 @@ def _asked_for(cameras: tuple[Camera, ...], wanted: str, notices: list[Notice]) 
         text = f"{len(matches)} cameras are named {wanted}; the first by path is used"
         notices.append(Notice(matches[0].path, text))
     return matches[0]
-
-
-def see_everything(bounds: Bounds) -> tuple[Camera, str]:
-    """A camera that frames everything, and from where, in words: what is flat like a picture from the front, all else
-    from the front, the right and above, so that nothing along an axis is seen edge-on; what lies flat more from above,
-    what stands flat along the depth more from the right."""
-    low, high = np.array(bounds, np.float64)
-    width, height, depth = high - low
-    least = _FLAT * float(max(width, height, depth))
-    if depth <= least:
-        return frame_everything(bounds), "the front"
-    turn = math.radians(60.0 if width <= least else 30.0)
-    rise = math.radians(45.0 if height <= least else 20.0)
-    back = np.array([math.sin(turn) * math.cos(rise), math.sin(rise), math.cos(turn) * math.cos(rise)])
-    pose = _looking(np.zeros(3), -back)
-    right, top = (side / 2 / FOCAL_LENGTH for side in APERTURE)
-    corners = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * (high - low) / 2 @ pose[:3, :3]
-    needed = np.maximum(np.abs(corners[:, 0]) / right, np.abs(corners[:, 1]) / top) + corners[:, 2]
-    distance = _AIR * float(needed.max())
-    pose[:3, 3] = (low + high) / 2 + distance * back
-    window = (-right, right, -top, top)
-    return Camera("", pose, window, clipping=(distance * 1.0e-3, distance * 1.0e3)), "the front, the right and above"
-
-
-def frame_everything(bounds: Bounds) -> Camera:
-    """A 50 mm camera in front of the bounds, looking along -Z, as far away as usdrecord puts its own: the diagonal of
-    the bounds' front face spans the picture's width. Bounds so tall that this would cut them are seen from farther.
-
-    Args:
-        bounds: min and max [m], engine world
-    """
-    low, high = np.array(bounds, np.float64)
-    width, height, depth = high - low
-    right, top = APERTURE[0] / 2 / FOCAL_LENGTH, APERTURE[1] / 2 / FOCAL_LENGTH
-    distance = float(max(math.hypot(width, height) / 2 / right, height / 2 / top) + depth / 2) or 1.0
-    pose = np.eye(4)
-    pose[:3, 3] = (low + high) / 2 + (0.0, 0.0, distance)
-    return Camera("", pose, (-right, right, -top, top), clipping=(distance * 1.0e-3, distance * 1.0e3))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeVar
 
-from pxr import UsdUtils
+from pxr import Tf, UsdUtils
+
+Found = TypeVar("Found")
 
 
 @contextmanager
@@ -18,6 +20,17 @@ def captured() -> Iterator[list[str]]:
         yield heard
     finally:
         heard.extend(words_of(diagnostic) for diagnostic in delegate.TakeUncoalescedDiagnostics())
+
+
+def opened(how: Callable[[], Found | None]) -> tuple[Found | None, str]:
+    """What USD opens, and, where that is None, why in its own words."""
+    found = None
+    with captured() as heard:
+        try:
+            found = how()
+        except Tf.ErrorException as error:
+            heard.extend(words_of(part) for part in error.args)
+    return found, heard[0] if heard else "USD gives no reason"
 
 
 def words_of(diagnostic: Any) -> str:

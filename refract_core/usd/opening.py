@@ -7,11 +7,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from pxr import Sdf, Tf, Usd
+from pxr import Sdf, Usd
 
 from ..errors import UsageError
 from ..settings import Opening
-from .diagnostics import captured, words_of
+from .diagnostics import captured, opened
 from .layers import mtlx
 from .layers.write import STAYS_BELOW
 
@@ -67,15 +67,10 @@ def _lay_over(stage: Usd.Stage, name: str) -> None:
     path = os.path.abspath(name)
     if not Path(path).is_file():
         raise UsageError(f"--session-layer {name}: there is no such file; name a .usd, .usda or .usdc layer")
-    with captured() as heard:
-        try:
-            layer = Sdf.Layer.FindOrOpen(path)
-        except Tf.ErrorException as error:
-            heard.extend(words_of(part) for part in error.args)
-            layer = None
-        if layer is None:
-            reason = heard[0] if heard else "USD gives no reason"
-            raise UsageError(f"--session-layer {name}: cannot be read as .usd, .usda or .usdc: {reason}")
+    layer, reason = opened(lambda: Sdf.Layer.FindOrOpen(path))
+    if layer is None:
+        raise UsageError(f"--session-layer {name}: cannot be read as .usd, .usda or .usdc: {reason}")
+    with captured():
         if not layer.dirty:
             layer.Reload()  # USD keeps layers in memory; a changed file would show its old content
         session = stage.GetSessionLayer()
@@ -131,10 +126,10 @@ def select_variants(stage: Usd.Stage, chosen: Iterable[str]) -> None:
             raise UsageError(f"{said}: the stage has no {what}; {_with_sets(stage)}")
         known = prim.GetVariantSets().GetNames()
         if group not in known:
-            raise UsageError(f"{said}: the prim has the sets {', '.join(known) or '(none)'}")
+            raise UsageError(f"{said}: the prim has no set '{group}'; it has the sets {', '.join(known) or '(none)'}")
         one = prim.GetVariantSet(group)
         if name not in one.GetVariantNames():
-            raise UsageError(f"{said}: choose from {', '.join(one.GetVariantNames())}")
+            raise UsageError(f"{said}: '{group}' has no '{name}'; choose from {', '.join(one.GetVariantNames())}")
         with Usd.EditContext(stage, stage.GetSessionLayer()), captured():
             one.SetVariantSelection(name)
             mtlx.stand_in(stage)

@@ -35,10 +35,13 @@ class Product(NamedTuple):
     """As `productName` has it, with #### for the frame, whichever of the usual ways it is written in"""
     settings: dict[str, object]
     """Fields of `RenderSettings` that it authors over those of its settings"""
-    aovs: tuple[str, ...]
-    """In the order of its variables; () where it has none, and the format decides"""
     names: dict[str, str]
-    """AOV -> what its channels are called in a file that has several"""
+    """AOV -> what its channels are called in a file that has several; in the order of its variables"""
+
+    @property
+    def aovs(self) -> tuple[str, ...]:
+        """() where it has no variables, and the format decides."""
+        return tuple(self.names)
 
 
 def read_products(stage: Usd.Stage, prim_path: str = "", notices: list[Notice] | None = None) -> list[Product]:
@@ -68,8 +71,8 @@ def read_products(stage: Usd.Stage, prim_path: str = "", notices: list[Notice] |
             told.append(Notice(str(target), text))
             continue
         tell_ignored(product, told)
-        aovs, names = _variables(product, told)
-        found.append(Product(str(target), _file(product), frame_of(product), aovs, names))
+        names = _variables(product, told)
+        found.append(Product(str(target), _file(product), frame_of(product), names))
     return found
 
 
@@ -78,8 +81,8 @@ def _file(product: Usd.Prim) -> str:
     return _FRAME.sub(lambda found: "#" * max(1, int(next(filter(None, found.groups()), "1"))), name)
 
 
-def _variables(product: Usd.Prim, notices: list[Notice]) -> tuple[tuple[str, ...], dict[str, str]]:
-    """AOVs, and their names in the file."""
+def _variables(product: Usd.Prim, notices: list[Notice]) -> dict[str, str]:
+    """AOVs in their order, with their names in the file."""
     names: dict[str, str] = {}
     targets = UsdRender.Product(product).GetOrderedVarsRel().GetForwardedTargets()
     for target in targets:
@@ -102,7 +105,7 @@ def _variables(product: Usd.Prim, notices: list[Notice]) -> tuple[tuple[str, ...
             names[aov] = name
     if targets and not names:
         names["beauty"] = "beauty"
-    return tuple(names), names
+    return names
 
 
 def _aov(source: str, kind: str) -> str | None:

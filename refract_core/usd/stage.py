@@ -15,10 +15,10 @@ import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdLux
 
 from ..errors import StageError, UsageError
-from ..scene import F64, Mesh, Notice, Scene, Sphere, prim_of
+from ..scene import F64, Balls, Mesh, Notice, Scene, Sphere, prim_of
 from ..settings import AS_IT_IS, Opening
 from .camera import choose_camera, read_cameras
-from .diagnostics import captured, words_of
+from .diagnostics import captured, opened, words_of
 from .geometry.cages import FINENESS
 from .geometry.curves import cuts_for
 from .geometry.dots import Dots, read_dots, spread_dots
@@ -28,7 +28,7 @@ from .geometry.place import Placed, bounds_of, place, to_mesh, to_sphere
 from .geometry.refined import MOST_TRIANGLES, Fineness
 from .geometry.shapes import INWARDS, TURN, Shape, read_shape
 from .geometry.skel import posed
-from .geometry.traverse import POINTS, Placement, refuse_too_many, some_of, walk
+from .geometry.traverse import POINTS, Placement, refuse_too_many, some_of, told_of, walk
 from .geometry.ways import with_ways
 from .layers import mtlx
 from .lights.meshes import glowing, mesh_lights
@@ -75,14 +75,8 @@ def open_stage(path: str | os.PathLike[str], opening: Opening = AS_IT_IS) -> Usd
     if file.suffix.lower() == ".usdz" and not zipfile.is_zipfile(file):  # USD may open what is left as an empty stage
         reason = "the package has no directory at its end, so it was cut off; copy or pack it again"
         raise StageError(f"{name}: cannot be read as .usd, .usda, .usdc or .usdz: {reason}")
-    with captured() as heard:
-        try:
-            stage = _opened(name, mask_of(opening))
-        except Tf.ErrorException as error:
-            heard.extend(words_of(part) for part in error.args)
-            stage = None
+    stage, reason = opened(lambda: _opened(name, mask_of(opening)))
     if stage is None:
-        reason = heard[0] if heard else "USD gives no reason"
         raise StageError(f"{name}: cannot be read as .usd, .usda, .usdc or .usdz: {reason}")
     with captured():
         for layer in stage.GetUsedLayers():  # USD keeps layers in memory; a changed file would show its old content
@@ -110,7 +104,7 @@ def time_range(stage: Usd.Stage) -> tuple[float, float]:
 
 
 def load_stage(
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | Usd.Stage | Sdf.Layer,
     *,
     time_code: float | None = None,
     purposes: tuple[str, ...] = ("default", "render"),
@@ -121,18 +115,37 @@ def load_stage(
     """Reads a stage at one time.
 
     Args:
+        path: of a file; or a stage that is open, or a layer as the root of one, with what was edited and not saved.
+            They are not changed, and how a stage is loaded, masked and muted is as its owner has it
         time_code: None takes the stage's startTimeCode, or 0 where it has none
         purposes: which of default, render, proxy and guide are drawn
         camera: prim path or name of the camera that `Scene.cameras` begins with; '' chooses one
         complexity: how fine subdivision surfaces are: low, medium, high or veryhigh
-        opening: session layer, variants and mask
+        opening: session layer, variants and mask; of files, for an open stage is its owner's to change
 
     Raises:
         StageError: the stage cannot be opened or read.
-        UsageError: it has no such camera, there is no such complexity, or the opening asks for what is not there.
+        UsageError: it has no such camera, there is no such complexity, the opening asks for what is not there, or
+            `path` is none of the three.
     """
     how: dict[str, Any] = {"time_code": time_code, "purposes": purposes, "camera": camera, "complexity": complexity}
-    return scene_from_stage(open_stage(path, opening), **how)
+    if isinstance(path, str | os.PathLike):
+        return scene_from_stage(open_stage(path, opening), **how)
+    return scene_from_stage(_held(path, opening), **how)
+
+
+def _held(given: Usd.Stage | Sdf.Layer, opening: Opening) -> Usd.Stage:
+    """The stage that somebody has in memory. Raises UsageError, StageError."""
+    register()
+    if not isinstance(given, Usd.Stage | Sdf.Layer):
+        raise UsageError(f"a stage is a path, a Usd.Stage or an Sdf.Layer, not {type(given).__name__}")
+    if opening != AS_IT_IS:
+        raise UsageError("an opening is for files; edit the session layer, variants or mask of the open stage itself")
+    if not given:
+        raise StageError("the stage is closed: nothing holds it any more; keep it, or give its path")
+    stage = given if isinstance(given, Usd.Stage) else Usd.Stage.Open(given)
+    refuse_too_many(stage)
+    return stage
 
 
 def scene_from_stage(
@@ -143,11 +156,13 @@ def scene_from_stage(
     camera: str = "",
     complexity: str = "low",
     keep: Keep | None = None,
+    orbits: bool = False,
 ) -> Scene:
     """Reads an opened stage at one time; see `load_stage`. The stage is not changed.
 
     Args:
         keep: which of the drawn prims are read at all; None reads every one
+        orbits: the picture is taken by a camera of its own (`RenderSettings.orbits`), so nothing is said of those here
     """
     if time_code is not None and not math.isfinite(time_code):
         raise UsageError(f"time_code is {time_code}; it must be a finite number")
@@ -159,7 +174,7 @@ def scene_from_stage(
         stage = recognised(posed(stage, time, notices))
     with captured() as heard:
         try:
-            scene = _read(stage, time, purposes, camera, complexity, notices, keep)
+            scene = _read(stage, time, purposes, camera, complexity, notices, keep, orbits)
         except Tf.ErrorException as error:
             reason = words_of(error.args[0])
             raise StageError(f"{stage.GetRootLayer().identifier}: USD cannot read it: {reason}") from error
@@ -189,17 +204,15 @@ def _grouped(notices: dict[Notice, None]) -> list[Notice]:
     for notice in notices:
         where = paths.get(notice.text, [notice.path])
         if where[0] == notice.path:
-            text = f"{notice.text} ({some_of(where)})" if len(where) > 1 else notice.text
-            found.append(Notice(notice.path, text))
+            found.append(told_of(where, notice.text))
     return found
 
 
 def _composition_notices(stage: Usd.Stage) -> list[Notice]:
     """What composition could not bring together: missing references, payloads, sublayers."""
     root = stage.GetRootLayer().identifier
-    found = []
-    unread = dict(mtlx.told(stage))
-    found += [Notice(path, text) for path, text in mtlx.told(stage)]
+    found = [Notice(path, text) for path, text in mtlx.told(stage)]
+    unread = {notice.path for notice in found}
     for error in stage.GetCompositionErrors():
         prim = error.rootSite.path
         where = root if prim in (Sdf.Path.emptyPath, Sdf.Path.absoluteRootPath) else str(prim)
@@ -219,7 +232,7 @@ def _origin(low: F64, high: F64) -> F64:
 
 def _read(
     stage: Usd.Stage, time: Usd.TimeCode, purposes: tuple[str, ...], camera: str, complexity: str,
-    notices: list[Notice], keep: Keep | None,
+    notices: list[Notice], keep: Keep | None, orbits: bool,
 ) -> Scene:  # fmt: skip
     """Everything of a stage in engine world, whose origin is the middle of what is drawn."""
     metres_per_unit = stage_unit(stage, notices)
@@ -246,10 +259,11 @@ def _read(
         "metres_per_unit": metres_per_unit,
         "notices": notices,
     }
-    still = [mesh.static for mesh in meshes] + [ball.static for ball in spheres]
-    still += [many.mesh.static for many in instances] + [cloud.static for cloud in balls]
+    every_mesh = (*meshes, *(many.mesh for many in instances))
+    every_ball: tuple[Sphere | Balls, ...] = (*spheres, *balls)
+    moving = not (all(mesh.static for mesh in every_mesh) and all(ball.static for ball in every_ball))
     every_camera = read_cameras(stage, time, **frame)
-    cameras = choose_camera(stage, time, every_camera, camera, bounds, moving=not all(still), **frame)
+    cameras = choose_camera(stage, time, every_camera, camera, bounds, moving=moving, orbits=orbits, **frame)
     things = [prim_of(mesh.path) for mesh in meshes] + [prim_of(ball.path) for ball in spheres]
     every_path = [many.paths for many in instances] + [cloud.paths for cloud in balls]
     things += [owner for some in every_path for owner, _ in some.owners()]
@@ -257,9 +271,8 @@ def _read(
     lights, environment = read_lights(stage, time, purposes=purposes, drawn=paths, **frame)
     every = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
     glow = {m for m, material in enumerate(tables.materials) if material.emits}
-    every_mesh = (*meshes, *(many.mesh for many in instances))
     used = {m for mesh in every_mesh for m in np.unique(mesh.materials).tolist()}
-    used |= {ball.material for ball in spheres} | {cloud.material for cloud in balls}
+    used |= {ball.material for ball in every_ball}
     lit = bool(glow & used) or any(prim.HasAPI(UsdLux.LightAPI) for prim in every)
     return Scene(
         meshes=meshes,
@@ -341,7 +354,7 @@ def _placed(
         else:
             parts[prim.GetPath()] = _part(prim, bound, shapes, tables)
     tables.notices.extend(_coarse(parts, asked, tables.fineness))
-    tables.notices.extend(_turned([prim for prim in prims if prim.GetPath() in parts], parts))
+    tables.notices.extend(_turned(prims, parts))
     proxies = any(placement.prim.IsInstanceProxy() for placement in placements)
     own = mesh_lights(stage) if proxies else frozenset()
     solid = [placement for placement in placements if placement.prim.GetTypeName() != POINTS]
@@ -349,7 +362,10 @@ def _placed(
     for placement in placements:
         if (dots := points.get(placement.prim.GetPath())) is not None:
             for one in spread_dots(dots, placement, metres_from_stage, tables):
-                (clouds if isinstance(one, Cloud) else groups).append(one)  # type: ignore[arg-type]
+                if isinstance(one, Cloud):
+                    clouds.append(one)
+                else:
+                    groups.append(one)
     placed = []
     for placement in alone:
         part = parts[placement.prim.GetPath()]
@@ -376,14 +392,14 @@ def _turned(prims: list[Usd.Prim], parts: dict[Sdf.Path, Part | None]) -> Iterat
     """Which glass is inside out; the instances of one native prototype are told of together."""
     found: dict[Sdf.Path, list[str]] = {}
     for prim in prims:
-        part = parts[prim.GetPath()]
+        part = parts.get(prim.GetPath())
         if part is not None and part.shape.inside_out:
             authored = prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim
             found.setdefault(authored.GetPath(), []).append(str(prim.GetPath()))
     bubble = "a bubble belongs to the mesh of the glass around it, or is a body of ior 1"
     text = f"{INWARDS}; it is drawn turned outwards. {TURN.capitalize()} (refract validate STAGE --fix OUT); {bubble}"
     for paths in found.values():
-        yield Notice(paths[0], f"{text} ({some_of(paths)})" if len(paths) > 1 else text)
+        yield told_of(paths, text)
 
 
 def _part(prim: Usd.Prim, bound: Bound, shapes: dict[Sdf.Path, Shape | None], tables: Tables) -> Part | None:

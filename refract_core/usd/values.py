@@ -1,9 +1,10 @@
-"""A value as USD gives it, as plain numbers; and a number as it is written into a stage or told to a person."""
+"""A value as USD gives it, as plain numbers; and a number or name as it is written into a stage or told to a person.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from typing import Any
 
 
@@ -37,6 +38,14 @@ def listed(values: Iterable[float]) -> str:
 def neat(value: float) -> float:
     """Six digits: what float32 holds, and a person can read."""
     return float(f"{value:.6g}")
+
+
+def free_name(name: str, taken: Container[str]) -> str:
+    """A name, with a number after it where it is taken already."""
+    unique, count = name, 1
+    while unique in taken:
+        unique, count = f"{name}_{count}", count + 1
+    return unique
 
 
 _LONGEST = 80

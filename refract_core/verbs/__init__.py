@@ -1,5 +1,5 @@
-"""What a person can ask for, from Python, the command line or HTTP: render files, bake, compare, convert, inspect,
-validate, warm up. Knows neither of the three.
+"""What a person can ask for, from Python, the command line or HTTP: render files, turn, bake, compare, convert,
+inspect, validate, warm up, look after the installation. Knows neither of the three.
 """
 
 __all__ = [
@@ -10,11 +10,17 @@ __all__ = [
     "compare_renders",
     "compare_report",
     "convert",
+    "doctor",
     "executors",
     "inspect",
+    "join",
     "node",
     "override",
     "render_files",
+    "samples",
+    "schema",
+    "table",
+    "turntable",
     "validate",
     "validate_forms",
     "validate_many",

@@ -155,9 +155,17 @@ def bake_thickness(order: ThicknessOrder, report: Report, cancel: Callable[[], b
         _tell(report, found, work, lost_bindings(layer, bound))
         _write_pictures(work.pictures)
         save(layer, order.out)
+    if chosen and not work.rows:
+        report.warning(order.out, f"nothing was measured, and the layer changes nothing: {_why_nothing(work)}")
     left = len(work.left) + len(work.fixed)
     report.done(order.out, f"{len(work.rows)} prims measured along {order.along}, {left} left alone")
     return tuple(work.rows)
+
+
+def _why_nothing(work: Work) -> str:
+    if work.fixed:
+        return f"the model of {work.fixed[0]} fixes the thickness; give it another, such as sphere or box"
+    return "all of the glass was left alone, for the reasons above"
 
 
 def bake_over(

@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ..images.pictures import read_planes
-from .compare_numbers import WEIGHTS, Contrast, find
+from .compare_numbers import WEIGHTS, Contrast, Planes, find
 from .compare_report import Account, Pictures, check_folder, write_account
+
+Named = tuple[str, Planes]
+"""What messages call a picture, and its planes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,16 +36,31 @@ def compare_pictures(order: PicturesOrder) -> Account:
     """
     if order.out:
         check_folder(order.out, overwrite=order.overwrite)
-    picture, reference = read_planes(order.picture), read_planes(order.reference)
-    contrast = Contrast(picture, reference, (order.picture, order.reference))
+    named = (order.picture, read_planes(order.picture)), (order.reference, read_planes(order.reference))
+    account, contrast = _account(*named, order.fail_under)
+    if order.out:
+        write_account(account, Pictures(None, None, contrast), order.out)
+    return account
+
+
+def compare_planes(picture: Named, reference: Named) -> Account:
+    """The same of planes in memory.
+
+    Raises:
+        UsageError: the sizes differ, or a plane holds NaN.
+    """
+    return _account(picture, reference, None)[0]
+
+
+def _account(one: Named, other: Named, fail_under: float | None) -> tuple[Account, Contrast]:
+    (picture_name, picture), (reference_name, reference) = one, other
+    contrast = Contrast(picture, reference, (picture_name, reference_name))
     planes = {name: plane for name, plane in picture.items() if name in ("beauty", "mask", "confidence", *WEIGHTS)}
     if "mask" not in planes and "mask" in reference:
         planes["mask"] = reference["mask"]
     height, width = contrast.test.shape[:2]
     account = Account(
-        picture=order.picture, reference=order.reference, size=(width, height),
-        findings=find(contrast, planes, {}), fail_under=order.fail_under,
+        picture=picture_name, reference=reference_name, size=(width, height),
+        findings=find(contrast, planes, {}), fail_under=fail_under,
     )  # fmt: skip
-    if order.out:
-        write_account(account, Pictures(None, None, contrast), order.out)
-    return account
+    return account, contrast

@@ -111,7 +111,9 @@ def compare_stage(order: CompareOrder, report: Report, cancel: Callable[[], bool
     report.progress(0.0, "reading the stage")
     stage = open_stage(order.stage, order.opening)
     notices: list[Notice] = []
-    settings = chosen_settings(read_settings(stage, order.settings_prim, notices), order.overrides)
+    # A studio is not invented here: it would stand in the picture as in the reference, and hide what a stage lacks.
+    bare = {"studio": "none"}
+    settings = chosen_settings({**bare, **read_settings(stage, order.settings_prim, notices)}, order.overrides)
     if order.suggest and settings.model:
         raise UsageError(f"the stage's RenderSettings choose the model '{settings.model}'; --suggest needs none")
     reader = partial(scene_from_stage, time_code=order.time_code, purposes=settings.purposes, camera=settings.camera)

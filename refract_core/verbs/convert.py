@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -61,11 +61,10 @@ class ConvertOrder:
         ):  # fmt: skip
             if value and value not in known:
                 raise UsageError(f"{flag} is '{value}', which is not known; choose from {', '.join(known)}")
-        own = {"gltf": GLTF, "mtlx": (MTLX,)}.get(self.kind, ())
+        if self.to == "mtlx" and self.kind != "mtlx":
+            raise UsageError(f"--to mtlx writes a file of its own; end the name of OUT with {MTLX}")
         if self.kind and self.to not in ("", self.kind):
             raise UsageError(f"--to {self.to} goes into a USD file, and {self.out} is none; leave --to out")
-        if self.to == "mtlx" and not own:
-            raise UsageError(f"--to mtlx writes a file of its own; end the name of OUT with {MTLX}")
 
     @property
     def kind(self) -> str:
@@ -129,7 +128,7 @@ def convert(
         StageError: the stage cannot be read, or OUT cannot be written.
         Cancelled: `cancel` said so; nothing was written.
     """
-    check_out(order.stage, order.out, overwrite=order.overwrite, extensions=(*GLTF, MTLX) if order.kind else EXTENSIONS)
+    check_out(order.stage, order.out, overwrite=order.overwrite, extensions=(*EXTENSIONS, *GLTF, MTLX))
     progress(0.0, "opening")
     with _folder(order) as folder:
         work, found, pictures = _look(order, folder)
@@ -146,19 +145,17 @@ def convert(
             from .bake_thickness import bake_over
 
             prims = [path for plan in plans for path in plan.sized]
-            left = bake_over(work.layer, prims, cancel=cancel, opening=order.opening)
+            left = bake_over(work.layer, prims, cancel=cancel, opening=work.opening)
         _write_pictures(pictures)
         rows = [plan.row for plan in plans]
         if order.kind:
             told, more = _export(order, work, folder)
-            rows = [replace(row, notes=(*row.notes, *told.get(row.path, ()))) for row in rows]
-            return Converted(tuple(rows), (*work.notices, *left, *more))
-        if order.to:
-            within_reach = [row.path for row in rows if row.action != "skipped"]
-            told = write_surfaces(work.layer, order.to, within_reach)
-            rows = [replace(row, notes=(*row.notes, *told.get(row.path, ()))) for row in rows]
-        save(work.layer, order.out)
-    return Converted(tuple(rows), (*work.notices, *left))
+        else:
+            told, more = _write_back(order.to, work, rows) if order.to else {}, ()
+            save(work.layer, order.out)
+    noted = [replace(row, notes=(*row.notes, *told.pop(row.path, ()))) for row in rows]
+    of_others = (Notice(path, text) for path, texts in told.items() for text in texts)  # opaque ones have no row
+    return Converted(tuple(noted), (*work.notices, *left, *more, *of_others))
 
 
 @contextmanager
@@ -172,16 +169,21 @@ def _folder(order: ConvertOrder) -> Iterator[str]:
         yield folder
 
 
-def _export(
-    order: ConvertOrder, work: Work, folder: str
-) -> tuple[dict[str, tuple[str, ...]], tuple[Notice, ...]]:
+_Told = dict[str, tuple[str, ...]]
+"""What there is to say of single materials, by path."""
+
+
+def _write_back(target: str, work: Work, rows: Iterable[Row]) -> _Told:
+    """Standard surfaces into the layer. What was done."""
+    # Unmasked: what a material in an instance is made of may lie outside of the mask.
+    stage = stage_of(work.layer, replace(work.opening, mask=()))
+    return write_surfaces(stage, target, [row.path for row in rows if row.action != "skipped"])
+
+
+def _export(order: ConvertOrder, work: Work, folder: str) -> tuple[_Told, tuple[Notice, ...]]:
     """Write OUT as what it is. What it does not say of single materials, and of all."""
     stage = stage_of(work.layer)
-    if order.kind == "gltf":
-        written = write_gltf(stage, order.out)
-        write_whole(order.out, written.content, StageError)
-        return written.notes, written.notices
-    made = write_mtlx(stage, order.out, folder)
+    made = write_gltf(stage, order.out) if order.kind == "gltf" else write_mtlx(stage, order.out, folder)
     _write_pictures(made.pictures)
     write_whole(order.out, made.content, StageError)
     return made.notes, made.notices
@@ -190,6 +192,9 @@ def _export(
 def _look(order: ConvertOrder, pictures: str) -> tuple[Work, list[Glass], dict[str, bytes]]:
     """The stage with its glass, and the pictures that belong beside it: path and content."""
     if order.stage.lower().endswith(GLTF):
+        if order.opening != AS_IT_IS:
+            flags = "--variant, --session-layer and --mask"
+            raise UsageError(f"{flags} change how a USD stage is opened, and {order.stage} is none; leave them out")
         work, found, content = gltf_stage.begin(order.stage, pictures)
         if not order.overwrite:
             refuse_existing(path for path, picture in content.items() if not _holds(path, picture))
@@ -202,7 +207,7 @@ def _holds(path: str, content: bytes) -> bool:
     return os.path.isfile(path) and Path(path).read_bytes() == content
 
 
-def _write_pictures(pictures: dict[str, bytes]) -> None:
+def _write_pictures(pictures: Mapping[str, bytes]) -> None:
     for path, content in pictures.items():
         make_folder_of(path)
         write_whole(path, content, StageError)

@@ -11,6 +11,8 @@ The JSON of `--json` (its `format` changes when a field does; lengths are metres
      "environment": bool,                                               a dome light
      "glass": [{"path", "material", "by": "RefractMaterialAPI" | "surface shader",
                 "model", "ior": {"value": x or null, "by": "constant" | "texture" | "primvar"},
+                "roughness": as ior, "transmittance_color": {"value": [r, g, b] or null, "by"}, linear,
+                "absorption_distance": x,      white light has that colour after so much of the glass
                 "thickness": {"how": "typed" | "default" | "mapped" | "measured" | "fixed" | "unused",
                               "least": x, "most": x},
                 "closed": bool, "convex": bool, "size": [x, y, z] ascending, along its own axes,
@@ -117,7 +119,10 @@ def _glass(piece: Glass, seen: Overview, inside: list[tuple[str, float]], layers
         "material": piece.row.name,
         "by": API if piece.row.name in seen.with_api else "surface shader",
         "model": piece.model.name.lower(),
-        "ior": _ior(piece.row.inputs[Param.IOR]),
+        "ior": _number(piece.row.inputs[Param.IOR]),
+        "roughness": _number(piece.row.inputs[Param.ROUGHNESS]),
+        "transmittance_color": _colour(piece.row.inputs[Param.TRANSMITTANCE]),
+        "absorption_distance": neat(piece.row.absorption_distance),
         "thickness": {"how": how, "least": neat(thickness.low), "most": neat(thickness.high)},
         "closed": piece.closed,
         "convex": piece.convex,
@@ -128,9 +133,16 @@ def _glass(piece: Glass, seen: Overview, inside: list[tuple[str, float]], layers
     }
 
 
-def _ior(source: Source) -> Report:
-    by = "texture" if source.texture >= 0 else "primvar" if source.primvar else "constant"
-    return {"value": neat(source.value[0]) if by == "constant" else None, "by": by}
+def _by(source: Source) -> str:
+    return "texture" if source.texture >= 0 else "primvar" if source.primvar else "constant"
+
+
+def _number(source: Source) -> Report:
+    return {"value": None if source.driven else neat(source.value[0]), "by": _by(source)}
+
+
+def _colour(source: Source) -> Report:
+    return {"value": None if source.driven else [neat(part) for part in source.value[:3]], "by": _by(source)}
 
 
 def _tiers(seen: Overview, reached: bool) -> list[str]:

@@ -1,11 +1,13 @@
 """What the orders of several verbs share: values in their ranges, what `--only` names, files that may be there already,
-a wish to stop, and sizes as a person reads them.
+a wish to stop, sizes as a person reads them, and the memory that the work took.
 """
 
 from __future__ import annotations
 
 import fnmatch
 import os
+import re
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -84,6 +86,22 @@ def stop_if(cancel: Callable[[], bool], state: str = "") -> None:
     """Raises Cancelled where `cancel` says so. `state`: what is left on disk then."""
     if cancel():
         raise Cancelled(f"cancelled; {state}" if state else "cancelled")
+
+
+def peak_memory() -> int:
+    """Most memory that this process has had in use [bytes]; 0 where nobody knows (proc_pid_status(5), getrusage(2))."""
+    try:
+        # getrusage counts what the process had before it became this program, too.
+        found = re.search(r"^VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text("ascii", "replace"), re.MULTILINE)
+    except OSError:
+        found = None
+    if found:
+        return int(found[1]) * 1024
+    try:
+        import resource
+    except ImportError:
+        return 0
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def size_text(count: int) -> str:

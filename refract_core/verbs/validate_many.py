@@ -16,13 +16,18 @@ from concurrent.futures.process import BrokenProcessPool
 
 from ..errors import RefractError, UsageError
 from ..settings import AS_IT_IS, Opening
+from ..usd.layers.write import EXTENSIONS
 from ..usd.rules.findings import ERROR, Finding, Repair
 from .orders import stop_if
 from .validate import ValidateOrder, Verdict, validate
 
-EXTENSIONS = (".usd", ".usda", ".usdc", ".usdz")
 UNREADABLE = "refract.unreadable"
 _DIED = "USD ended its process over this file, which is damaged"
+
+
+def names_one(names: Sequence[str]) -> bool:
+    """A person named one stage, and no folder of them."""
+    return len(names) == 1 and not os.path.isdir(names[0])
 
 
 def stages_named(names: Sequence[str]) -> list[str]:

@@ -2,4 +2,4 @@
 planes.
 """
 
-__all__ = ["camera", "gbuffer", "places", "planes", "pyramid", "quiet", "screen"]
+__all__ = ["camera", "crop", "gbuffer", "mattes", "orbit", "places", "planes", "pyramid", "quiet", "screen"]

@@ -21,7 +21,7 @@ from ..world.embree import (
     has_hit,
     set_ray,
 )
-from ..world.environment import radiance
+from ..world.environment import background
 from ..world.shading import Block, load_hits, shade
 from ..world.surface import Hit, hit_in
 from ..world.tables import World
@@ -95,9 +95,9 @@ def is_refractive(world: World, hit: Hit) -> bool:
 
 
 @inlined
-def add_view_ray(packet: Packet, view: View, lane: int, x: int, y: int, mask: int) -> float:
-    """Put the view ray of a pixel into a lane. Returns where it ends, the far plane [m]."""
-    origin, direction, cosine = pixel_ray(view, x + 0.5, y + 0.5)
+def add_view_ray(packet: Packet, view: View, lane: int, px: float, py: float, mask: int) -> float:
+    """Put the view ray through a pixel coordinate into a lane. Returns where it ends, the far plane [m]."""
+    origin, direction, cosine = pixel_ray(view, px, py)
     stop = view.clipping[1] / cosine
     set_ray(packet, lane, origin, direction, view.clipping[0] / cosine, stop, mask)
     return stop
@@ -123,7 +123,7 @@ def opaque_tile(
             for lane in range(LANES):
                 x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
                 if x < width and y < height:
-                    far[lane] = add_view_ray(packet, view, lane, x, y, EVERYTHING)
+                    far[lane] = add_view_ray(packet, view, lane, x + 0.5, y + 0.5, EVERYTHING)
                     belongs_to(packet, lane, x, y, sample)
                     set_key(block.key, lane, Key(x, y, 0, sample))
             intersect_world(packet, world, far, COHERENT)
@@ -155,7 +155,7 @@ def trace_behind_glass(scratch: ViewScratch, world: World, view: View, x0: int, 
         packet.valid[lane] = 0
         if again:
             x, y = x0 + lane % BLOCK_WIDTH, y0 + lane // BLOCK_WIDTH
-            scratch.far[lane] = add_view_ray(packet, view, lane, x, y, OPAQUE)
+            scratch.far[lane] = add_view_ray(packet, view, lane, x + 0.5, y + 0.5, OPAQUE)
             belongs_to(packet, lane, x, y, sample)
     intersect_world(packet, world, scratch.far, COHERENT)
     for lane in range(LANES):
@@ -200,8 +200,8 @@ def write_opaque(layer: OpaqueLayer, block: Block, world: World, view: View, x0:
             layer.color[y, x, 3] = 1.0
             continue
         layer.depth[y, x] = math.inf
-        sky = radiance(world.environment, direction, 0.0) if world.environment.present else (0.0, 0.0, 0.0)
+        sky, covered = background(world.environment, direction)
         for c in range(3):
             layer.color[y, x, c] = sky[c]
             layer.normal[y, x, c] = 0.0
-        layer.color[y, x, 3] = 1.0 if world.environment.present else 0.0
+        layer.color[y, x, 3] = covered

@@ -25,6 +25,6 @@ def seen_places(
         count = min(LANES, last * width - start)
         for lane in range(count):
             x, y = (start + lane) % width, (start + lane) // width
-            scratch.far[lane] = add_view_ray(scratch.packet, view, lane, x, y, OPAQUE)
+            scratch.far[lane] = add_view_ray(scratch.packet, view, lane, x + 0.5, y + 0.5, OPAQUE)
         intersect_world(scratch.packet, world, scratch.far, COHERENT)
         note_hits(scratch.block, scratch.packet, world, start, count, point, normal)

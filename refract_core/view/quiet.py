@@ -164,7 +164,7 @@ def _look(
                 x, y = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
                 wanted = x0 - _MARGIN <= x <= x1 + _MARGIN and y0 - _MARGIN <= y <= y1 + _MARGIN
                 if wanted and 0 <= x < width and 0 <= y < height:
-                    far[lane] = add_view_ray(packet, view, lane, x, y, EVERYTHING)
+                    far[lane] = add_view_ray(packet, view, lane, x + 0.5, y + 0.5, EVERYTHING)
                     belongs_to(packet, lane, x, y, _FIRST)
             intersect_world(packet, world, far, COHERENT)
             behind = False

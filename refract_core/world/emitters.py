@@ -82,7 +82,7 @@ def what_glows(world: World, scene: Scene, eye: F64) -> Glow | None:
             balls += _lamp(world, part, pieces.radiance[0])
         else:
             if exact[part]:  # its triangles are larger than it is
-                pieces = pieces._replace(radiance=pieces.radiance * (4.0 * math.pi / areas(_round()).sum()))
+                pieces = pieces._replace(radiance=pieces.radiance * _share_of_round())
             objects.setdefault(int(world.geometry.thing[part]), []).append(pieces)
     whole = [_Pieces(*(np.concatenate(column) for column in zip(*parts, strict=True))) for parts in objects.values()]
     lights, trees = _lights(whole)
@@ -216,6 +216,12 @@ def _round() -> F64:
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     grown: F64 = faces / np.abs((normals * faces[:, 0]).sum(axis=1)).min() * 1.0001
     return grown
+
+
+@cache
+def _share_of_round() -> float:
+    """What the unit sphere has of the area of the triangles around it."""
+    return 4.0 * math.pi / float(areas(_round()).sum())
 
 
 def _lamp(world: World, part: int, radiance: F64) -> list[Light]:

@@ -66,6 +66,12 @@ class EnvironmentTable(NamedTuple):
     """shape (H, G): the same for columns within a row"""
     row_cosines: F64_1D
     """shape (H + 1,): cosine of the angle to +Y above row i"""
+    hidden: bool
+    """what is seen past everything, and through glass, is the backdrop"""
+    open: bool
+    """and that is nothing at all"""
+    backdrop: F64_1D
+    """shape (3,): radiance"""
     tint: F32_2D
     """shape (H * W, 3): colour of what comes from a texel that directions are drawn from, at luminance 1"""
 
@@ -80,8 +86,10 @@ def pack(environment: Environment | None) -> EnvironmentTable:
         SceneError: The map is not (H, W, 3) or the rotation not (3, 3) and finite.
     """
     pixels, rotation = np.zeros((1, 2, 3), np.float32), np.eye(3)
+    hidden, backdrop = False, None
     if environment is not None:
         pixels, rotation = _checked(environment)
+        hidden, backdrop = environment.hidden, environment.backdrop
     pool, levels, poles = _pyramid(pixels)
     irradiance_pool = np.zeros((IRRADIANCE_SHAPE[0] * IRRADIANCE_SHAPE[1], 3), np.float32)
     if environment is not None:
@@ -104,6 +112,9 @@ def pack(environment: Environment | None) -> EnvironmentTable:
         row_guide=guide_of(row_cdf),
         column_guide=np.stack([guide_of(cdf) for cdf in column_cdf]),
         row_cosines=np.cos(np.linspace(0.0, math.pi, len(row_cdf))),
+        hidden=hidden,
+        open=hidden and backdrop is None,
+        backdrop=np.array(backdrop or (0.0, 0.0, 0.0), np.float64),
         tint=tint,
     )
 
@@ -341,6 +352,21 @@ def radiance(table: EnvironmentTable, d: Vec, footprint: float) -> Vec:
         return a
     b = _at_level(table, level + 1, u, v)
     return ((1.0 - t) * a[0] + t * b[0], (1.0 - t) * a[1] + t * b[1], (1.0 - t) * a[2] + t * b[2])
+
+
+@inlined
+def background(table: EnvironmentTable, d: Vec) -> tuple[Vec, float]:
+    """What a view ray sees that meets nothing, and how much that covers, 0 or 1.
+
+    Args:
+        table: From `pack`.
+        d: World direction the ray travels in.
+    """
+    if not table.present or table.open:
+        return (0.0, 0.0, 0.0), 0.0
+    if table.hidden:
+        return (table.backdrop[0], table.backdrop[1], table.backdrop[2]), 1.0
+    return radiance(table, d, 0.0), 1.0
 
 
 @inlined

@@ -6,8 +6,9 @@ as will do: a million instances are as many triangles as no memory holds.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from itertools import accumulate
 from typing import TypeVar
 
 import numpy as np
@@ -113,33 +114,52 @@ def flat(scene: Scene, most: int) -> Scene:
 def apart(scene: Scene, most: int) -> Scene:
     """The scene with instances as meshes and balls as spheres, as far as they have together no more triangles than so
     many, of which a sphere counts as some."""
-    meshes, kept = list(scene.meshes), []
-    for many in scene.instances:
-        if (size := len(many) * len(many.mesh.triangles)) <= most:
-            most -= size
-            meshes.extend(placed(many, k) for k in range(len(many)))
-        else:
-            kept.append(many)
-    spheres, round_ones = list(scene.spheres), []
-    for balls in scene.balls:
-        if (size := _TRIANGLES_OF_A_BALL * len(balls)) <= most:
-            most -= size
-            spheres.extend(sphere(balls, k) for k in range(len(balls)))
-        else:
-            round_ones.append(balls)
     if not scene.instances and not scene.balls:
         return scene
-    left = replace(scene, instances=tuple(kept), balls=tuple(round_ones))
+    left = most
+
+    def fits(many: Instances | Balls) -> bool:
+        nonlocal left
+        size = len(many) * (_TRIANGLES_OF_A_BALL if isinstance(many, Balls) else len(many.mesh.triangles))
+        if size > left:
+            return False
+        left -= size
+        return True
+
+    return _loosened(scene, fits)
+
+
+def _loosened(scene: Scene, chosen: Callable[[Instances | Balls], bool]) -> Scene:
+    """The scene with some of its instances as meshes, and some of its balls as spheres. `chosen` is asked once of each,
+    in order."""
+    meshes, spheres = list(scene.meshes), list(scene.spheres)
+    instances: list[Instances] = []
+    balls: list[Balls] = []
+    for many in scene.instances:
+        if chosen(many):
+            meshes.extend(placed(many, k) for k in range(len(many)))
+        else:
+            instances.append(many)
+    for some in scene.balls:
+        if chosen(some):
+            spheres.extend(sphere(some, k) for k in range(len(some)))
+        else:
+            balls.append(some)
+    left = replace(scene, instances=tuple(instances), balls=tuple(balls))
     return replace(left, meshes=tuple(meshes), spheres=tuple(spheres))
 
 
-def around(many: Instances, point: Iterable[float]) -> list[int]:
-    """Which of a closed mesh's places go round a point [m]."""
-    at, mesh = np.array(tuple(point), np.float64), many.mesh
-    if not len(mesh.points):
-        return []
-    low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
+def around(many: Instances | Balls, point: Iterable[float]) -> list[int]:
+    """Which of a closed mesh's places, or of many spheres, go round a point [m]."""
+    at = np.array(tuple(point), np.float64)
     found: list[int] = []
+    if isinstance(many, Balls):
+        found = np.flatnonzero(np.linalg.norm(many.centres - at, axis=1) < many.radii).tolist()
+        return found
+    mesh = many.mesh
+    if not len(mesh.points):
+        return found
+    low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
     for step in _steps(many):
         linear, origin = linears(many, step)
         inside = np.linalg.solve(linear, (at - origin)[:, :, None])[:, :, 0]
@@ -176,43 +196,38 @@ def settled(scene: Scene) -> Scene:
     instances that collections tell apart, of what a probe sees or a light lights, are apart."""
     if not scene.instances and not scene.balls:
         return scene
-    meshes, kept, notices = list(scene.meshes), [], list(scene.notices)
-    spheres, round_ones = list(scene.spheres), []
-    left = _MOST_GLOWING
-    for many in scene.instances:
+    notices, left = list(scene.notices), _MOST_GLOWING
+
+    def lights(many: Instances | Balls) -> bool:
+        nonlocal left
         if not _glows(many, scene):
-            kept.append(many)
+            return False
+        if isinstance(many, Balls):
+            if len(many) <= _MOST_GLOWING_BALLS:
+                return True
+            text = f"its {len(many)} spheres glow, but light nothing: at most {_MOST_GLOWING_BALLS} do"
         elif (size := len(many) * len(many.mesh.triangles)) <= left:
             left -= size
-            meshes.extend(placed(many, k) for k in range(len(many)))
+            return True
         else:
             text = f"its {len(many)} instances glow, but light nothing: they have {size} triangles together, and what "
-            notices.append(Notice(many.paths[0], f"{text}glows in many places may have {_MOST_GLOWING}"))
-            kept.append(many)
-    for balls in scene.balls:
-        material = scene.materials[balls.material]
-        if not material.emits or material.refractive:
-            round_ones.append(balls)
-        elif len(balls) <= _MOST_GLOWING_BALLS:
-            spheres.extend(sphere(balls, k) for k in range(len(balls)))
-        else:
-            text = f"its {len(balls)} spheres glow, but light nothing: at most {_MOST_GLOWING_BALLS} do"
-            notices.append(Notice(balls.paths[0], text))
-            round_ones.append(balls)
+            text += f"glows in many places may have {_MOST_GLOWING}"
+        notices.append(Notice(many.paths[0], text))
+        return False
+
+    alone = _loosened(scene, lights)
     told = [frozenset(paths) for paths in _collections(scene)]
     return replace(
-        scene,
-        meshes=tuple(meshes),
-        spheres=tuple(spheres),
-        instances=tuple(one for many in kept for one in (_apart(many, told) if told else [many])),
-        balls=tuple(one for many in round_ones for one in (_apart(many, told) if told else [many])),
+        alone,
+        instances=tuple(one for many in alone.instances for one in (_apart(many, told) if told else [many])),
+        balls=tuple(one for many in alone.balls for one in (_apart(many, told) if told else [many])),
         notices=tuple(notices),
     )
 
 
-def _glows(many: Instances, scene: Scene) -> bool:
-    used = (scene.materials[m] for m in np.unique(many.mesh.materials).tolist())
-    return any(material.emits and not material.refractive for material in used)
+def _glows(many: Instances | Balls, scene: Scene) -> bool:
+    used = [many.material] if isinstance(many, Balls) else np.unique(many.mesh.materials).tolist()
+    return any(scene.materials[m].emits and not scene.materials[m].refractive for m in used)
 
 
 def _collections(scene: Scene) -> Iterator[tuple[str, ...]]:
@@ -239,14 +254,20 @@ def thing_count(scene: Scene) -> int:
     return len(scene.meshes) + len(scene.spheres) + sum(map(len, scene.instances)) + sum(map(len, scene.balls))
 
 
+def numbered(scene: Scene) -> tuple[list[tuple[int, Instances]], list[tuple[int, Balls]]]:
+    """Instances, and balls, each with the number that the first of its things has."""
+    of_instances = list(accumulate(map(len, scene.instances), initial=len(scene.meshes) + len(scene.spheres)))
+    of_balls = list(accumulate(map(len, scene.balls), initial=of_instances[-1]))
+    return (
+        list(zip(of_instances[:-1], scene.instances, strict=True)),
+        list(zip(of_balls[:-1], scene.balls, strict=True)),
+    )
+
+
 def instances_at(scene: Scene, thing: int) -> Instances:
     """Those whose first has a number."""
-    first = len(scene.meshes) + len(scene.spheres)
-    for many in scene.instances:
-        if first == thing and len(many):
-            return many
-        first += len(many)
-    raise KeyError(thing)
+    # Those of no places have the number of the next, who come after them and so are what is found.
+    return dict(numbered(scene)[0])[thing]
 
 
 def paths_of(scene: Scene) -> Iterator[tuple[str, int]]:

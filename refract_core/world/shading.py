@@ -111,8 +111,10 @@ class Block(NamedTuple):
     """share of its radiance that shaping leaves for the first; where it is not even"""
     lamp_gleam: Vectors
     """and for the second"""
+    lamp_counts: Flags
+    """1 where it would bring anything"""
     lamp_asked: Flags
-    """1 where it would bring anything, and casts shadows"""
+    """1 where it casts shadows, too"""
     lamp_seen: Vectors
     """share of its light that arrives, colour by colour, 0 .. 1"""
     lamp_weight: Scalars
@@ -258,9 +260,12 @@ def _gather_lights(block: Block, packet: Packet, world: World, mask: int) -> Non
     lights = world.lights
     for l in range(lights.kind.shape[0]):  # noqa: E741
         for lane in range(LANES):
-            block.lamp_asked[lane] = 0
+            block.lamp_asked[lane] = block.lamp_counts[lane] = 0
+            if block.on[lane] == 0 or not aim_light(block, lane, lights, l):
+                continue
+            block.lamp_counts[lane] = 1
             put(block.lamp_seen, lane, (1.0, 1.0, 1.0))
-            if block.on[lane] != 0 and aim_light(block, lane, lights, l) and lights.casts_shadow[l] != 0:
+            if lights.casts_shadow[l] != 0:
                 block.lamp_asked[lane] = 1
                 block.lamp_weights[lane] = 0.0
                 put(block.lamp_seen, lane, (0.0, 0.0, 0.0))
@@ -283,7 +288,7 @@ def _gather_lights(block: Block, packet: Packet, world: World, mask: int) -> Non
         for lane in range(LANES):
             if block.lamp_asked[lane] != 0:
                 put(block.lamp_seen, lane, share_of_lamp(row(block.lamp_seen, lane), block.lamp_weights[lane]))
-            if block.on[lane] != 0:
+            if block.lamp_counts[lane] != 0:
                 add_light(block, lane, lights, l)
 
 

@@ -13,7 +13,7 @@ from ..kernels.lanes import Scalars, Words
 from ..kernels.vec import Vec, add, along, cross, dot, flip_towards, length, normalize, row, scale, sub
 from ..optics.models import on_open_mesh
 from ..scene import Channel, Param
-from .embree import GEOM, HIT_U, HIT_V, INST, INST_PRIM, PRIM, Packet, hit_distance
+from .embree import GEOM, HIT_U, HIT_V, INST, INST_PRIM, NG_X, NG_Y, NG_Z, PRIM, Packet, hit_distance
 from .tables import Geometry, World
 from .textures import Rgba, sample
 
@@ -183,11 +183,20 @@ def _moved(at: F32_2D, p: Vec) -> Vec:
 
 @inlined
 def _turned(at: F32_2D, n: Vec) -> Vec:
-    """A normal of the mesh, where a transform takes it, by the inverse transpose; of any length."""
+    """A normal of the mesh, where a transform takes it, by its cofactors; of any length, and reversed by one that
+    mirrors."""
     x, y, z = _linear(at, 0), _linear(at, 1), _linear(at, 2)
-    across = cross(y, z)
-    sense = -1.0 if dot(x, across) < 0.0 else 1.0
-    return (sense * dot(across, n), sense * dot(cross(z, x), n), sense * dot(cross(x, y), n))
+    return (dot(cross(y, z), n), dot(cross(z, x), n), dot(cross(x, y), n))
+
+
+@inlined
+def facing_in(packet: Packet, lane: int, geometry: Geometry) -> Vec:
+    """Unit geometric normal of the hit in a lane of a traced packet, as Embree has it: to one side or the other."""
+    rays, words = packet.rays, packet.words
+    n: Vec = (np.float64(rays[NG_X, lane]), np.float64(rays[NG_Y, lane]), np.float64(rays[NG_Z, lane]))
+    if words[INST, lane] >= 0:
+        n = _turned(geometry.transforms[geometry.place[words[INST, lane]] + words[INST_PRIM, lane]], n)
+    return normalize(n)
 
 
 @inlined
@@ -243,20 +252,11 @@ def interaction(geometry: Geometry, hit: Hit, ray: Ray, footprint: float) -> Int
         if k >= 0:
             n = geometry.normals[k + hit.primitive]
             w = 1.0 - u - v
-            if place >= 0:  # each corner's first, and of length 1, as of a mesh that stands there
+            n0, n1, n2 = row(n, 0), row(n, 1), row(n, 2)
+            if place >= 0:  # each corner's first, and of length 1, as of a mesh that stands there; reversed or not
                 at = geometry.transforms[place + hit.instance]
-                n0 = normalize(_turned(at, row(n, 0)))
-                n1 = normalize(_turned(at, row(n, 1)))
-                n2 = normalize(_turned(at, row(n, 2)))
-                ns = normalize(along(along(scale(n0, w), n1, u), n2, v))
-            else:
-                ns = normalize(
-                    (
-                        w * n[0, 0] + u * n[1, 0] + v * n[2, 0],
-                        w * n[0, 1] + u * n[1, 1] + v * n[2, 1],
-                        w * n[0, 2] + u * n[1, 2] + v * n[2, 2],
-                    )
-                )
+                n0, n1, n2 = normalize(_turned(at, n0)), normalize(_turned(at, n1)), normalize(_turned(at, n2))
+            ns = normalize(along(along(scale(n0, w), n1, u), n2, v))
             if dot(ns, ns) == 0.0:
                 ns = ng
             ns = flip_towards(ns, ng)

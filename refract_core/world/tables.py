@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,7 +28,7 @@ from .embree import (
     Part,
 )
 from .environment import EnvironmentTable
-from .instances import bounds_of
+from .instances import bounds_of, numbered
 from .lights import LightTable
 from .textures import TextureTable
 
@@ -283,7 +284,7 @@ class _Pile:
             return first, first_normal, self._add_primvars(primvars)
 
         first, first_normal, known = rows() if share is None else self.once(share, rows)
-        known = known | self._add_primvars(of_places or {})
+        known = known | self._add_primvars(of_places or {}, shared=True)
         self.primvar_rows.append([known.get(name, (-1, 0, 0, 0)) for name in self.slots])
         count = 1 if part.triangles is None else len(part.triangles)
         place, places, ball = -1, 1, -1
@@ -322,9 +323,14 @@ class _Pile:
         self.triangle_count += len(triangles)
         return first, first_normal
 
-    def _add_primvars(self, primvars: dict[str, NDArray[np.float32]]) -> dict[str, tuple[int, int, int, int]]:
-        """Those that some material reads."""
-        return {name: self._add_primvar(values) for name, values in primvars.items() if name in self.slots}
+    def _add_primvars(
+        self, primvars: dict[str, NDArray[np.float32]], *, shared: bool = False
+    ) -> dict[str, tuple[int, int, int, int]]:
+        """Those that some material reads. `shared`: parts of one mesh have them in common."""
+        read = {name: values for name, values in primvars.items() if name in self.slots}
+        if not shared:
+            return {name: self._add_primvar(values) for name, values in read.items()}
+        return {name: self.once(("primvar", id(v)), partial(self._add_primvar, v)) for name, v in read.items()}
 
     def _add_primvar(self, values: NDArray[np.float32]) -> tuple[int, int, int, int]:
         """First float, stride, step and size. Values are of triangle corners, or (N, D) of places."""
@@ -364,26 +370,23 @@ def pack_geometry(
     for thing, mesh in enumerate(scene.meshes):
         _check_mesh(mesh, len(scene.materials))
         _add_mesh(pile, mesh, thing, masks(mesh, mesh.path))
-    thing = len(scene.meshes)
-    for ball in scene.spheres:
+    for thing, ball in enumerate(scene.spheres, len(scene.meshes)):
         _add_sphere(pile, ball, thing, mask(ball.material, ball.static, ball.path))
-        thing += 1
-    for many in scene.instances:
+    instances, clouds = numbered(scene)
+    for thing, many in instances:
         _check_instances(many, len(scene.materials))
         told = [masks(many.mesh, owner) for owner in dict.fromkeys(owner for owner, _ in many.paths.owners())]
         if any((other != told[0]).any() for other in told[1:]):
             raise SceneError(f"{many.mesh.path}: some rays see some of its instances alone; settle the scene first")
         if len(many):
             _add_instances(pile, many, thing, told[0])
-        thing += len(many)
-    for balls in scene.balls:
+    for thing, balls in clouds:
         _check_balls(balls, len(scene.materials))
         seen = {mask(balls.material, balls.static, owner) for owner, _ in balls.paths.owners()}
         if len(seen) > 1:
             raise SceneError(f"{balls.paths[0]}: some rays see some of its spheres alone; settle the scene first")
         if len(balls):
             _add_balls(pile, balls, thing, seen.pop())
-        thing += len(balls)
     points = np.concatenate(pile.points) if pile.points else np.zeros((0, 3), np.float32)
     bvh = Bvh(points, pile.parts)
     columns: list[Any] = list(zip(*pile.rows, strict=True)) or [()] * 10
@@ -449,9 +452,11 @@ def places_of(geometry: Geometry, part: int) -> NDArray[np.float32]:
 
 
 def balls_of(geometry: Geometry, part: int) -> NDArray[np.float32]:
-    """Centres and radii of a part that is many spheres, shape (N, 4) [m]."""
+    """Centres and radii of the spheres that a part is, shape (N, 4) [m]; none of triangles."""
     k = int(geometry.ball[part])
-    return geometry.balls[k : k + int(geometry.places[part])]
+    if k >= 0:
+        return geometry.balls[k : k + int(geometry.places[part])]
+    return geometry.sphere[part : part + 1] if geometry.sphere[part, 3] > 0.0 else geometry.balls[:0]
 
 
 def caster_sets(scene: Scene) -> list[frozenset[str]]:

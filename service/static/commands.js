@@ -25,7 +25,7 @@ export function asCli(source, request) {
   const words = ["refract", "render", source.name, pictureName(source.name).replace(/\.png$/, `${hashes}.png`)];
   for (const [name, value] of Object.entries(flags)) {
     const flag = `--${name.replaceAll("_", "-")}`;
-    words.push(...(value < 0 ? [`${flag}=${value}`] : [flag, String(value)]));
+    words.push(...(String(value).startsWith("-") ? [`${flag}=${value}`] : [flag, String(value)]));
   }
   for (const [path, fields] of Object.entries(overrides)) {
     for (const [name, value] of Object.entries(fields)) words.push("--override", `${path}.${name}=${value}`);

@@ -3,7 +3,8 @@
 import { $, make } from "./dom.js";
 import { drawGlass, showGlass } from "./glass.js";
 import { changed, renderAll, stop } from "./jobs.js";
-import { NUMBERS } from "./settings.js";
+import { turnTo } from "./orbit.js";
+import { NUMBERS, ORBIT } from "./settings.js";
 import { SIDES, state, tell, update } from "./state.js";
 import { drawTiers } from "./tiers.js";
 import { MODELS, MODEL_HELP } from "./words.js";
@@ -20,11 +21,18 @@ export function drawChoices() {
   drawGlass(facts);
 }
 
+/** What a moving camera changes of the form. */
+export function showCamera() {
+  const settings = state.settings[state.edit];
+  for (const name of ORBIT) if (document.activeElement !== $(`set-${name}`)) $(`set-${name}`).value = settings[name] ?? "";
+  $("set-camera").value = settings.camera;
+}
+
 /** Every control of the form shows the side being edited. */
 export function showSettings() {
   const settings = state.settings[state.edit];
   for (const name of NUMBERS) if (document.activeElement !== $(`set-${name}`)) $(`set-${name}`).value = settings[name] ?? "";
-  $("set-camera").value = settings.camera;
+  showCamera();
   if ($("set-camera").value !== settings.camera) $("set-camera").append(make("option", { value: settings.camera, textContent: settings.camera, selected: true }));
   $("set-screen").value = settings.screen;
   $("set-model").value = settings.model;
@@ -63,8 +71,9 @@ function applyPreset(name) {
 export function wireSettings() {
   for (const name of NUMBERS) {
     $(`set-${name}`).oninput = ({ target }) => {
-      if (target.value !== "") update({ [name]: Number(target.value) });
-      else if (name === "time_code") update({ time_code: null });
+      const value = target.value === "" ? null : Number(target.value);
+      if (ORBIT.includes(name) && value !== null) turnTo({ [name]: value });
+      else if (value !== null || ORBIT.includes(name) || name === "time_code") update({ [name]: value });
     };
     $(`set-${name}`).onblur = showSettings;
   }

@@ -33,7 +33,7 @@ export function showGlass(overrides) {
   for (const node of document.querySelectorAll("#glass [data-path]")) {
     const value = overrides[node.dataset.path]?.[node.dataset.name];
     if (node.type === "checkbox") node.checked = Boolean(overrides[node.dataset.path]?.transmittanceColor);
-    else if (node.type === "color") node.value = value ? hexOf(value) : "#ffffff";
+    else if (node.type === "color") node.value = value ? hexOf(value) : node.dataset.rest;
     else if (document.activeElement !== node) node.value = value ?? "";
     const slider = node.type === "number" ? $(`${node.id}-slider`) : null;
     if (slider && document.activeElement !== slider) slider.value = value ?? slider.dataset.rest;
@@ -44,13 +44,14 @@ function glassControls(path, pieces, place) {
   const [first] = pieces;
   const unit = state.facts.metres_per_unit || 1;
   const size = Math.max(...pieces.flatMap((piece) => piece.size), 0.01) / unit;
-  const thick = first.thickness.most / unit;
+  const length = (most, metres) => [short(size / 200), short(Math.max(most * size, 2 * metres / unit)), short(size / 200), metres / unit];
   const rows = [
-    ["ior", "Index of refraction", 1, 3, 0.01, first.ior.value],
-    ["thickness", "Thickness, scene units", short(size / 200), short(size * 2), short(size / 200), thick],
-    ["roughness", "Roughness", 0, 1, 0.01, null],
-    ["absorptionDistance", "Absorption distance, scene units", short(size / 200), short(size * 4), short(size / 200), null],
+    ["ior", "Index of refraction", 1, 3, 0.01, first.ior.value, first.ior.by],
+    ["thickness", "Thickness, scene units", ...length(2, first.thickness.most)],
+    ["roughness", "Roughness", 0, 1, 0.01, first.roughness.value, first.roughness.by],
+    ["absorptionDistance", "Absorption distance, scene units", ...length(4, first.absorption_distance)],
   ];
+  const authored = first.transmittance_color;
   const names = pieces.map((piece) => piece.path.split("/").pop()).join(", ");
   const reset = make("button", { type: "button", textContent: "As authored", onclick: () => { setOverride(path, {}); } });
   reset.setAttribute("aria-label", `${names}: as authored`);
@@ -59,20 +60,21 @@ function glassControls(path, pieces, place) {
   const known = (name) => ({ id: id(name), oninput: override, onchange: override });
   const model = make("select", known("model"), ...models.map(([value, textContent]) => make("option", { value, textContent })));
   const tinted = make("input", { type: "checkbox", ...known("tinted") });
-  const colour = make("input", { type: "color", value: "#ffffff", ...known("transmittanceColor") });
+  const colour = make("input", { type: "color", ...known("transmittanceColor") });
+  colour.dataset.rest = hexOf(authored.value ?? [1, 1, 1]);
   colour.setAttribute("aria-label", `${names}: colour after the absorption distance`);
   for (const [node, name] of [[model, "model"], [tinted, "tinted"], [colour, "transmittanceColor"]]) Object.assign(node.dataset, { path, name });
   return make("details", { open: place === 0, ariaLabel: names },
     make("summary", {}, names, make("span", { className: "quiet", textContent: path })),
     make("div", { className: "field" }, make("label", { htmlFor: model.id, textContent: `Model (authored: ${first.model})` }), model),
     ...rows.map((row) => numberControl(path, names, id(row[0]), row, known)),
-    make("div", { className: "field" }, make("label", { className: "tick" }, tinted, "Absorption colour"), colour), reset);
+    make("div", { className: "field" }, make("label", { className: "tick" }, tinted, authored.value ? "Other absorption colour" : `Absorption colour (by ${authored.by})`), colour), reset);
 }
 
 const short = (value) => Number(value.toPrecision(3));
 
-function numberControl(path, names, id, [name, label, min, max, step, authored], known) {
-  const number = make("input", { type: "number", min, step: "any", placeholder: authored === null ? "as is" : short(authored), ...known(name) });
+function numberControl(path, names, id, [name, label, min, max, step, authored, by = ""], known) {
+  const number = make("input", { type: "number", min, step: "any", placeholder: authored === null ? `by ${by}` : short(authored), ...known(name) });
   const slider = make("input", { type: "range", min, max, step, id: `${id}-slider`, oninput: () => { number.value = slider.value; override({ target: number }); } });
   slider.dataset.rest = authored ?? min;
   slider.setAttribute("aria-label", `${names}: ${label}, slider`);

@@ -9,12 +9,14 @@ import { ACTIVE, SIDES, keyOf, requestOf, sides, state, tell } from "./state.js"
 import { showButtons, showProgress } from "./status.js";
 
 let timer = 0;
+let address = 0;
 const sleep = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
 
 /** Something about the wanted picture changed: keep the address current, and render soon if so wished. */
 export function changed() {
   if (!state.source) return;
-  keepAddress(state);
+  clearTimeout(address);
+  address = setTimeout(() => state.source && keepAddress(state), 200); // browsers refuse it for every pixel of a drag
   clearTimeout(timer);
   if ($("auto").checked && state.facts) timer = setTimeout(renderAll, 450);
   showProgress();
@@ -54,10 +56,12 @@ async function submit(side) {
     if (run.status === "cancelled") return void erase(run);
     await follow(run);
     if (run.status === "done") await plane(run, "beauty");
+    if (run.status === "done" && state.runs[side] === run) state.moving[side] = null; // the picture itself is there
     else if (run.job.problem && state.runs[side] === run) showProblem(run.job.problem, side);
   } catch (error) {
     if (run.status === "cancelled" || error.name === "AbortError") return;
     run.status = "failed";
+    state.moving[side] = null;
     if (state.runs[side] === run) report(error, side);
   }
   if (state.runs[side] === run) tell("all");

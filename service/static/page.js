@@ -2,21 +2,25 @@
 // loaded, so that tests reach them without a document.
 
 import { $ } from "./dom.js";
-import { showSettings, wireSettings } from "./form.js";
+import { showCamera, showSettings, wireSettings } from "./form.js";
 import { changed, renderAll, stopAll } from "./jobs.js";
 import { fromFragment } from "./link.js";
+import { closeViewer } from "./live.js";
+import { showTurning, wireOrbit } from "./orbit.js";
 import { clearProblem } from "./problems.js";
-import { choose, listSamples, wireStage } from "./stage.js";
+import { choose, listSamples, showChoice, wireStage } from "./stage.js";
 import { hear, state } from "./state.js";
 import { showButtons, showNotices, showProgress } from "./status.js";
 import { wireTaking } from "./taking.js";
 import { paint, wireView } from "./view.js";
 
 function showAll() {
+  showChoice();
   showSettings();
   showProgress();
   showButtons();
   showNotices();
+  showTurning();
   paint();
 }
 
@@ -27,7 +31,6 @@ async function openLink() {
   $("view").value = link.view;
   if ($("view").selectedIndex < 0) $("view").value = state.view = "beauty";
   if (link.stage) {
-    $("sample").value = link.stage;
     await choose({ name: link.stage }, link);
   } else if (link.file) {
     state.keep = link;
@@ -36,11 +39,14 @@ async function openLink() {
 }
 
 async function start() {
-  hear("settings", () => { showSettings(); changed(); });
+  hear("settings", () => { showSettings(); showTurning(); changed(); });
+  hear("camera", () => { showCamera(); showTurning(); changed(); });
+  hear("frame", paint);
   hear("all", showAll);
   wireStage();
   wireSettings();
   wireView();
+  wireOrbit();
   wireTaking();
   $("render").onclick = renderAll;
   $("cancel").onclick = () => { stopAll(); showAll(); $("render").focus(); };
@@ -53,7 +59,7 @@ async function start() {
     if (!state.source) await openLink();
   };
   addEventListener("hashchange", openLink);
-  addEventListener("pagehide", stopAll);
+  addEventListener("pagehide", () => { stopAll(); closeViewer(); });
   showSettings();
   await listSamples();
   await openLink();

@@ -2,14 +2,17 @@
 
 import { MODELS, SCREENS, TIERS } from "./words.js";
 
-export const NUMBERS = ["image_width", "image_height", "samples", "max_layers", "exposure", "time_code"];
+// Where a camera of the page's own stands. Without any of them the picture is taken by the stage's.
+export const ORBIT = ["azimuth", "elevation", "distance"];
+export const NUMBERS = ["image_width", "image_height", "samples", "max_layers", "exposure", "time_code", ...ORBIT];
+export const NO_ORBIT = { azimuth: null, elevation: null, distance: null, look_at: null };
 const GLASS_NUMBERS = ["ior", "thickness", "roughness", "absorptionDistance"];
 
 /** What a render of this stage does when nothing is asked, and a size that suits a page. */
 export function defaultSettings(facts) {
   const authored = facts?.settings ?? {};
   return {
-    camera: "", time_code: null, image_width: 480, image_height: 0, samples: authored.samples ?? 16, exposure: 0,
+    camera: "", ...NO_ORBIT, time_code: null, image_width: 480, image_height: 0, samples: authored.samples ?? 16, exposure: 0,
     tiers: [...(authored.tiers ?? ["screen", "probe", "ray", "sky"])], screen: "traced", model: "",
     max_layers: authored.max_layers ?? 16, overrides: {},
   };
@@ -26,7 +29,7 @@ export function requestSettings(settings, facts) {
 }
 
 const isNumber = (value) => typeof value === "number" && Number.isFinite(value);
-const isColour = (value) => Array.isArray(value) && value.length === 3 && value.every(isNumber);
+const areThree = (value) => Array.isArray(value) && value.length === 3 && value.every(isNumber);
 
 /** Settings out of a link: known names with values of their kind; all else is dropped. */
 export function cleanSettings(given, facts) {
@@ -34,6 +37,7 @@ export function cleanSettings(given, facts) {
   if (!given || typeof given !== "object") return clean;
   for (const name of NUMBERS) if (isNumber(given[name])) clean[name] = given[name];
   if (typeof given.camera === "string") clean.camera = given.camera;
+  if (areThree(given.look_at)) clean.look_at = [...given.look_at];
   if (SCREENS.includes(given.screen)) clean.screen = given.screen;
   if (MODELS.includes(given.model)) clean.model = given.model;
   const tiers = Array.isArray(given.tiers) ? TIERS.filter((tier) => given.tiers.includes(tier)) : [];
@@ -49,6 +53,6 @@ function cleanOverride(override) {
   const kept = {};
   for (const name of GLASS_NUMBERS) if (isNumber(override?.[name])) kept[name] = override[name];
   if (MODELS.includes(override?.model)) kept.model = override.model;
-  if (isColour(override?.transmittanceColor)) kept.transmittanceColor = [...override.transmittanceColor];
+  if (areThree(override?.transmittanceColor)) kept.transmittanceColor = [...override.transmittanceColor];
   return kept;
 }

@@ -1,9 +1,11 @@
 // Which stage is looked at: a sample of the server, or a file that is dropped or chosen.
 
 import { bodyOf, send } from "./api.js";
-import { $, counted, make } from "./dom.js";
+import { $, counted } from "./dom.js";
 import { drawChoices } from "./form.js";
 import { changed, stopAll } from "./jobs.js";
+import { drawGallery } from "./gallery.js";
+import { closeViewer } from "./live.js";
 import { clearProblem, report } from "./problems.js";
 import { cleanSettings } from "./settings.js";
 import { state, tell } from "./state.js";
@@ -11,19 +13,27 @@ import { state, tell } from "./state.js";
 export async function listSamples() {
   try {
     const { stages } = await (await send("v1/stages")).json();
-    const names = stages.map(({ path }) => path);
-    $("sample").replaceChildren(make("option", { value: "", textContent: "none" }),
-      ...names.map((name) => make("option", { value: name, textContent: name })));
+    drawGallery(stages, openSample);
   } catch (error) {
     report(error);
   }
 }
 
+/** The choice of stages stands alone while there is none, and is folded away while one is looked at. */
+export function showChoice() {
+  const folded = Boolean(state.source) && !state.choosing;
+  $("main").classList.toggle("empty", !state.source);
+  $("choice").hidden = folded;
+  $("other").hidden = !state.source;
+  $("other").setAttribute("aria-expanded", String(!folded));
+}
+
 /** Look into a stage, then draw its controls. `link` carries the settings of a shared link. */
 export async function choose(source, link = null) {
   stopAll();
+  closeViewer();
   const waiting = (state.source = source);
-  Object.assign(state, { facts: null, runs: { a: null, b: null } });
+  Object.assign(state, { choosing: false, facts: null, runs: { a: null, b: null }, moving: { a: null, b: null } });
   clearProblem();
   tell("all");
   $("facts").textContent = `Looking into ${source.name} …`;
@@ -61,13 +71,19 @@ function factsText(name, facts) {
 
 function openFile(file) {
   if (!file) return;
-  $("sample").value = "";
   choose({ name: file.name, file });
+}
+
+function openSample(name) {
+  $("file").value = "";
+  choose({ name });
+  $("picture").focus({ preventScroll: true }); // what was pressed is folded away
+  scrollTo({ top: 0 });
 }
 
 export function wireStage() {
   const drop = $("drop");
-  $("sample").onchange = ({ target }) => { if (target.value) { $("file").value = ""; choose({ name: target.value }); } };
+  $("other").onclick = () => { state.choosing = !state.choosing; showChoice(); };
   $("file").onchange = () => openFile($("file").files[0]);
   document.ondragover = (event) => {
     if (!event.dataTransfer.types.includes("Files")) return;

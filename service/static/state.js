@@ -7,8 +7,8 @@ export const SIDES = ["a", "b"];
 export const ACTIVE = ["sending", "queued", "running"];
 
 export const state = {
-  source: null, facts: null, settings: { a: defaultSettings(), b: defaultSettings() }, edit: "a", compare: false,
-  view: "beauty", split: 50, runs: { a: null, b: null }, token: "",
+  source: null, choosing: false, facts: null, settings: { a: defaultSettings(), b: defaultSettings() }, edit: "a", compare: false,
+  view: "beauty", split: 50, runs: { a: null, b: null }, moving: { a: null, b: null }, token: "",
 };
 
 export const sides = () => (state.compare ? SIDES : ["a"]);
@@ -23,7 +23,7 @@ export function update(part) {
 
 const listeners = {};
 
-/** `act` whenever `what` is told: "settings" (of the side being edited), or "all" (anything). One listener each. */
+/** `act` whenever `what` is told: "settings" (of a side), "camera", "frame" (while it moves), or "all" (anything). One listener each. */
 export function hear(what, act) {
   listeners[what] = act;
 }

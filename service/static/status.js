@@ -17,7 +17,13 @@ export function showProgress() {
   $("cancel").disabled = !sides().some((side) => ACTIVE.includes(state.runs[side]?.status));
 }
 
-/** A sentence for everybody; it moves in quarters, so that a screen reader is not flooded. */
+/** How long a job took, as " in 1.9 s"; "" where it does not say. */
+export function tookText(job) {
+  const seconds = (Date.parse(job?.finished) - Date.parse(job?.started)) / 1000;
+  return seconds >= 0 ? ` in ${seconds < 10 ? seconds.toFixed(1) : Math.round(seconds)} s` : "";
+}
+
+/** A sentence for everybody. How far a run is, is said by its bar alone: one number, and no flood for a screen reader. */
 function statusText() {
   if (!state.facts) return state.source ? "Looking into the stage." : "Pick a stage to begin.";
   const said = sides().map((side) => {
@@ -25,9 +31,10 @@ function statusText() {
     const name = state.compare ? `${side.toUpperCase()} ` : "";
     if (!run) return "";
     if (run.key !== keyOf(side)) return `${name}${$("auto").checked ? "changed, about to render" : "changed, not rendered yet"}`;
-    if (run.status === "running") return `${name}rendering, ${Math.floor(run.fraction * 4) * 25} %`;
+    if (run.status === "running") return `${name}rendering`;
+    if (run.status !== "done") return `${name}${run.status}`;
     const warnings = run.job?.warnings?.length ?? 0;
-    return `${name}${run.status}${run.status === "done" && warnings ? ` with ${counted(warnings, "notice")}, below` : ""}`;
+    return `${name}done${tookText(run.job)}${warnings ? ` with ${counted(warnings, "notice")}, below` : ""}`;
   }).filter(Boolean);
   const text = said.join("; ");
   return text ? `${text[0].toUpperCase()}${text.slice(1)}.` : "Ready to render.";

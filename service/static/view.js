@@ -11,7 +11,7 @@ let painting = 0;
 
 export async function paint() {
   const turn = ++painting;
-  const shown = sides().map((side) => [side, shownRun(side)]).filter(([, run]) => run);
+  const shown = sides().map((side) => [side, shownRun(side)]).filter(([side, run]) => run && !state.moving[side]);
   const scalar = SCALARS.includes(state.view);
   let loaded = [];
   try {
@@ -27,10 +27,19 @@ export async function paint() {
   const high = Math.max(1e-9, ...loaded.map(({ run }) => whiteOf(run)));
   for (const side of SIDES) {
     const one = loaded.find((entry) => entry.side === side);
-    $(`canvas-${side}`).hidden = !one;
-    if (one) draw($(`canvas-${side}`), one, scalar, high);
+    const frame = sides().includes(side) ? state.moving[side] : null;
+    $(`canvas-${side}`).hidden = !one && !frame;
+    if (frame) drawFrame($(`canvas-${side}`), frame);
+    else if (one) draw($(`canvas-${side}`), one, scalar, high);
   }
   showFigure(loaded, scalar, high);
+}
+
+/** A small picture of a camera that moves: smooth where it is drawn larger than it is. */
+function drawFrame(canvas, frame) {
+  Object.assign(canvas, { width: frame.width, height: frame.height });
+  canvas.classList.remove("old");
+  canvas.getContext("2d").drawImage(frame, 0, 0);
 }
 
 /** What white stands for in a run's PNG of the plane that is looked at. */
@@ -59,8 +68,8 @@ function coloured(beauty, data, mask, scale) {
 }
 
 function showFigure(loaded, scalar, high) {
-  const both = loaded.length === 2;
-  $("empty").hidden = loaded.length > 0;
+  const both = sides().length === 2 && sides().every((side) => !$(`canvas-${side}`).hidden);
+  $("empty").hidden = loaded.length > 0 || sides().some((side) => state.moving[side]);
   for (const id of ["split-field", "divider", "tag-a", "tag-b"]) $(id).hidden = !both;
   $("canvas-b").style.clipPath = "none";
   if (both) showSplit();
@@ -95,6 +104,6 @@ export function wireView() {
     const box = $("views").getBoundingClientRect();
     if (event.buttons && !$("divider").hidden) setSplit(((event.clientX - box.left) / box.width) * 100);
   };
-  $("views").onpointerdown = (event) => { $("views").setPointerCapture(event.pointerId); drag(event); };
-  $("views").onpointermove = drag;
+  $("views").addEventListener("pointerdown", (event) => { $("views").setPointerCapture(event.pointerId); drag(event); });
+  $("views").addEventListener("pointermove", drag);
 }

@@ -33,6 +33,19 @@ class Work(NamedTuple):
     """Metres per scene unit."""
     notices: tuple[Notice, ...]
     """What is missing from the stage, or was lost when it was made flat."""
+    opening: Opening = AS_IT_IS
+    """How to open the stage whose root the layer is, to see what was looked at; a flat layer holds that already."""
+
+
+class Written(NamedTuple):
+    """A file that is no USD, what it does not say, and what belongs beside it."""
+
+    content: bytes
+    notices: tuple[Notice, ...]
+    notes: dict[str, tuple[str, ...]]
+    """By material"""
+    pictures: Mapping[str, bytes] = MappingProxyType({})
+    """By path: what lay in a package, and is a file now"""
 
 
 class Addition(NamedTuple):
@@ -73,7 +86,8 @@ def begin(path: str, *, flatten: bool, opening: Opening = AS_IT_IS) -> Work:
     else:
         layer = overlay(path, made=MADE)
     layer.customLayerData = {**layer.customLayerData, RECORD: origin(path)}
-    return Work(stage, layer, Usd.TimeCode(time_range(stage)[0]), stage_unit(stage, notices), tuple(notices))
+    time, unit = Usd.TimeCode(time_range(stage)[0]), stage_unit(stage, notices)
+    return Work(stage, layer, time, unit, tuple(notices), AS_IT_IS if flatten else opening)
 
 
 def origin(path: str) -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from pxr import Gf, Sdf, Usd, UsdShade
@@ -69,20 +69,18 @@ def find_glass(stage: Usd.Stage, time: Usd.TimeCode, unit: float) -> list[Glass]
     Args:
         unit: metres per scene unit.
     """
-    found: list[Glass] = []
-    seen: set[Sdf.Path] = set()
     textures: dict[str, Texture] = {}
+    found = (_read(prim, time, unit, textures) for prim in every_material(stage))
+    return [glass for glass in found if glass is not None]
+
+
+def every_material(stage: Usd.Stage) -> Iterator[Usd.Prim]:
+    """Every material, in the order of the stage; one that instances share comes once, as the first has it."""
+    seen: set[Sdf.Path] = set()
     for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
-        if prim.GetTypeName() != "Material":
-            continue
-        place = original(prim)
-        if place in seen:
-            continue
-        seen.add(place)
-        glass = _read(prim, time, unit, textures)
-        if glass is not None:
-            found.append(glass)
-    return found
+        if prim.GetTypeName() == "Material" and (place := original(prim)) not in seen:
+            seen.add(place)
+            yield prim
 
 
 def original(prim: Usd.Prim) -> Sdf.Path:

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...images.pictures import png_bytes
-from ...images.srgb import srgb_decode, srgb_encode
+from ...images.srgb import linear_pixels, srgb_encode
 from ...models import Behind
 from ...scene import F32, Channel, Material, Param, Source, Texture, Wrap
-from ..values import neat
+from ..values import free_name, neat
 
 _WRAPS = {Wrap.CLAMP: 33071, Wrap.MIRROR: 33648, Wrap.REPEAT: 10497, Wrap.BLACK: 33071}
 _WHITE = (1.0, 1.0, 1.0)
@@ -152,12 +152,9 @@ class Maker:
         return source.value[0] if own is None else own
 
     def _name(self, path: str) -> str:
-        name = path.rpartition("/")[2] or "Material"
-        unique, count = name, 1
-        while unique in self._names:
-            unique, count = f"{name}_{count}", count + 1
-        self._names.add(unique)
-        return unique
+        name = free_name(path.rpartition("/")[2] or "Material", self._names)
+        self._names.add(name)
+        return name
 
     def _say(self, one: _One, text: str) -> None:
         self._notes.setdefault(one.material.name, {})[f"glTF: {text}"] = None
@@ -297,11 +294,7 @@ class Maker:
 
     def _values(self, source: Source) -> F32:
         """A picture with its factor and offset, linear, shape (H, W, 4)."""
-        texture = self._textures[source.texture]
-        pixels = texture.pixels
-        out = pixels.astype(np.float32) / np.float32(255.0) if pixels.dtype == np.uint8 else pixels.astype(np.float32)
-        if texture.srgb:
-            out[..., :3] = srgb_decode(out[..., :3])
+        out = linear_pixels(self._textures[source.texture])
         return np.asarray(out * np.array(source.scale, np.float32) + np.array(source.bias, np.float32), np.float32)
 
     def _texture(self, one: _One, planes: NDArray[Any], source: Source) -> dict[str, int]:

@@ -14,6 +14,7 @@ from ...errors import StageError
 from ...scene import F64
 from ..layers.write import RECORD
 from ..materials.surfaces import Surface
+from ..values import free_name
 from .author import Work, origin
 from .find import Glass
 from .gltf_file import Gltf, GltfMaterial, Picture, Primitive, read_gltf
@@ -78,12 +79,8 @@ def _names(wanted: list[str], taken: set[str] | None = None) -> list[str]:
     used = set(taken or ())
     found = []
     for name in wanted:
-        base = Tf.MakeValidIdentifier(re.sub(r"\W+", "_", name).strip("_") or "Prim")
-        unique, count = base, 1
-        while unique in used:
-            unique, count = f"{base}_{count}", count + 1
-        used.add(unique)
-        found.append(unique)
+        found.append(free_name(Tf.MakeValidIdentifier(re.sub(r"\W+", "_", name).strip("_") or "Prim"), used))
+        used.add(found[-1])
     return found
 
 

@@ -28,6 +28,8 @@ from ..geometry.primvars import spread
 from ..geometry.shapes import read_shape
 from ..geometry.triangulate import turned_over
 from ..stage import stage_unit, time_range
+from .author import Written
+from .find import original
 from .gltf_materials import Maker, Uv, uvs_of
 from .uses import drawn
 
@@ -63,15 +65,6 @@ class Document:
                 "count": len(values), "type": _WIDTHS[values.shape[1]]}  # fmt: skip
         self.accessors.append(made | more)
         return len(self.accessors) - 1
-
-
-class Written(NamedTuple):
-    """A file, and what it does not say."""
-
-    content: bytes
-    notices: tuple[Notice, ...]
-    notes: dict[str, tuple[str, ...]]
-    """By material"""
 
 
 class _Placed(NamedTuple):
@@ -113,6 +106,8 @@ def write_gltf(stage: Usd.Stage, out: str) -> Written:
         if key not in meshes:
             meshes[key] = _mesh(document, maker, one, tables.materials, open_ones)
         _node(document, nodes, roots, one, meshes[key])
+    if not placed:
+        notices.append(Notice(out, "nothing of the stage is drawn, so there is nothing in the glTF file"))
     if any(prim.HasAPI(UsdLux.LightAPI) or prim.IsA(UsdGeom.Camera) for prim in stage.Traverse()):
         notices.append(Notice(out, "lights and cameras are not written to a glTF file"))
     content = _file(document, maker, roots, text=os.path.splitext(out)[1].lower() == ".gltf")
@@ -133,10 +128,9 @@ def _placed(stage: Usd.Stage, tables: Tables, metres_from_stage: F64) -> Iterato
         if shape is None:
             continue
         part = assemble(prim, shape, bound, tables)
-        source = prim.GetPrimInPrototype().GetPath() if prim.IsInstanceProxy() else prim.GetPath()
         # Proxies of one prototype are one mesh, as far as they have the same materials and primvars.
         values = (primvar.tobytes() for _, primvar in sorted(part.primvars.items()))
-        part = known.setdefault((source, part.materials.tobytes(), *values), part)
+        part = known.setdefault((original(prim), part.materials.tobytes(), *values), part)
         for count, place in enumerate(places):
             path = str(prim.GetPath()) + (f"[{count}]" if len(places) > 1 else "")
             world = np.vstack((place[:3], (0.0, 0.0, 0.0, 1.0)))

@@ -19,6 +19,9 @@ from ...version import __version__
 from ..materials.read import read_material
 from ..materials.textures import file_of
 from ..stage import stage_unit, time_range
+from ..values import free_name
+from .author import Written
+from .find import every_material
 from .standard import write_open_pbr
 
 _KINDS = {
@@ -38,17 +41,6 @@ _NODES = {
 """Element, type, and types of the outputs by the definitions that are used."""
 
 
-class Written(NamedTuple):
-    """A file, what belongs beside it, and what it does not say."""
-
-    content: bytes
-    pictures: dict[str, bytes]
-    """By path: what lay in a package, and is a file now"""
-    notices: tuple[Notice, ...]
-    notes: dict[str, tuple[str, ...]]
-    """By material"""
-
-
 def write_mtlx(stage: Usd.Stage, out: str, folder: str) -> Written:
     """The bytes of a .mtlx file.
 
@@ -64,9 +56,7 @@ def write_mtlx(stage: Usd.Stage, out: str, folder: str) -> Written:
     elements: list[str] = []
     files = _Files(os.path.dirname(os.path.abspath(out)), folder, {}, {})
     taken: set[str] = set()
-    for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
-        if prim.GetTypeName() != "Material":
-            continue
+    for prim in every_material(stage):
         record = read_material(
             UsdShade.Material(prim), time, metres_per_unit=unit, closed=True, textures=textures, notices=notices
         )
@@ -78,11 +68,13 @@ def write_mtlx(stage: Usd.Stage, out: str, folder: str) -> Written:
             elements += _elements(scratch, name, taken, files)
         except ImageError as error:
             notes[str(prim.GetPath())] = (*notes[str(prim.GetPath())], f"MaterialX: not written: {error}")
+    if not notes:
+        notices.append(Notice(out, "the stage has no material, so there is nothing in the MaterialX file"))
     head = [
         '<?xml version="1.0"?>', f"<!-- refract {__version__}; lengths are in units of {unit:g} m -->",
         '<materialx version="1.39" colorspace="lin_rec709">', *elements, "</materialx>", "",
     ]  # fmt: skip
-    return Written("\n".join(head).encode(), files.taken, tuple(dict.fromkeys(notices)), notes)
+    return Written("\n".join(head).encode(), tuple(dict.fromkeys(notices)), notes, files.taken)
 
 
 class _Files(NamedTuple):
@@ -110,9 +102,8 @@ class _Files(NamedTuple):
 
 
 def _free(name: str, taken: set[str]) -> str:
-    unique, count = name, 1
-    while unique in taken:
-        unique, count = f"{name}_{count}", count + 1
+    """A name that no element has; it is taken then."""
+    unique = free_name(name, taken)
     taken.add(unique)
     return unique
 

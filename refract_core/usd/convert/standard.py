@@ -41,18 +41,17 @@ _KINDS = {float: Sdf.ValueTypeNames.Float, bool: Sdf.ValueTypeNames.Bool, tuple:
 _Inputs = dict[str, Any]
 
 
-def write_surfaces(layer: Sdf.Layer, target: str, paths: Iterable[str]) -> dict[str, tuple[str, ...]]:
+def write_surfaces(stage: Usd.Stage, target: str, paths: Iterable[str]) -> dict[str, tuple[str, ...]]:
     """Author the surfaces in a layer over a stage, or in a flat one.
 
     Args:
-        layer: what is to be written; RefractMaterialAPI is in it already.
+        stage: its root layer is what is to be written; RefractMaterialAPI is in it already.
         target: preview, openpbr or gltf.
         paths: materials.
 
     Returns:
         What was done, or why nothing, by material.
     """
-    stage = Usd.Stage.Open(layer)
     time = Usd.TimeCode(time_range(stage)[0])
     unit = stage_unit(stage, [])
     textures: dict[str, Texture] = {}
@@ -63,7 +62,7 @@ def write_surfaces(layer: Sdf.Layer, target: str, paths: Iterable[str]) -> dict[
         record = read_material(
             material, time, metres_per_unit=unit, closed=True, textures=textures, notices=notices
         )  # fmt: skip
-        told[path] = tuple(_write(layer, material, record, textures, _TARGETS[target], unit))
+        told[path] = tuple(_write(stage.GetRootLayer(), material, record, textures, _TARGETS[target], unit))
     return told
 
 

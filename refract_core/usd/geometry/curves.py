@@ -13,7 +13,7 @@ from pxr import Sdf, Usd, UsdGeom
 from ...scene import F32, F64, Notice
 from .along import BASES, STRAIGHT, Along, Rule
 from .cages import integers
-from .primvars import Topology, Unusable, as_values
+from .primvars import LARGEST, Topology, Unusable, as_values
 from .refined import Fineness
 from .traverse import CURVES, FEW, Placement, some_of
 from .triangulate import Index
@@ -26,7 +26,6 @@ LIMIT = {2: 1_000_000, 3: 2_000_000, 4: 3_000_000, 5: 4_000_000}
 """Triangles of all curves of a stage, by `Fineness.steps`, up to which they are cut as finely as they should be."""
 MOST = 4_000_000
 """Triangles of all curves of a stage; the plainest tubes may have as many whatever the complexity."""
-_LARGEST = 1.0e15
 
 
 class Cut(NamedTuple):
@@ -191,7 +190,7 @@ def _shares(asked: Sequence[int], limit: int) -> list[float]:
 
 
 def _rule(prim: Usd.Prim, time: Usd.TimeCode) -> Rule:
-    """Raises Unusable where a token is none of its schema's."""
+    """As authored; `_checked` says whether there is such a kind."""
     if prim.GetTypeName() == "HermiteCurves":
         return Rule("hermite", str(UsdGeom.Tokens.nonperiodic))
     curves = UsdGeom.BasisCurves(prim)
@@ -200,6 +199,7 @@ def _rule(prim: Usd.Prim, time: Usd.TimeCode) -> Rule:
 
 
 def _checked(rule: Rule) -> None:
+    """Raises Unusable where a token is none of its schema's."""
     if rule.basis != "hermite" and rule.basis not in BASES:
         raise Unusable(f"its basis is '{rule.basis}'; it must be bezier, bspline or catmullRom")
     if rule.wrap not in (UsdGeom.Tokens.nonperiodic, UsdGeom.Tokens.periodic, UsdGeom.Tokens.pinned):
@@ -225,7 +225,7 @@ def _usable(
         raise Unusable(f"curveVertexCounts has {int((counts < 0).sum())} negative values")
     points = values.astype(np.float64)
     controls = points if rule.basis != "hermite" else _hermite(prim, time, points)
-    wild = ~(np.abs(controls) <= _LARGEST).all(axis=1).reshape(-1, len(points)).all(axis=0)
+    wild = ~(np.abs(controls) <= LARGEST).all(axis=1).reshape(-1, len(points)).all(axis=0)
     bad = np.concatenate(([0], np.cumsum(wild)))
     ends = np.cumsum(counts)
     here = np.minimum(ends, len(points))
@@ -364,7 +364,7 @@ def _widths(prim: Usd.Prim, time: Usd.TimeCode, along: Along, points: int, notic
         notices.append(Notice(path, f"its curves have no widths; {WIDTH:g} scene unit is used, as usdview does"))
         return np.full(len(along.u), WIDTH)
     values, kind = authored
-    good: NDArray[np.bool_] = np.logical_and(values >= 0.0, values <= _LARGEST)
+    good: NDArray[np.bool_] = np.logical_and(values >= 0.0, values <= LARGEST)
     if lost := int((~good).sum()):
         text = f"widths has {lost} values that are negative, NaN or infinite; 0 is used in their place"
         notices.append(Notice(path, text))

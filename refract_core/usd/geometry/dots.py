@@ -20,10 +20,10 @@ from ...scene import F32, F64, Notice, Paths, Run
 from .gprims import unit_sphere
 from .many import Cloud, Group, even_scales, in_metres
 from .parts import Bound, Part, Tables, assemble
-from .place import BEYOND, LARGEST, of_instances
-from .primvars import Topology, Unusable, as_values, read_primvar
-from .shapes import Shape
-from .traverse import Placement, some_of
+from .place import BEYOND, NOTHING_LEFT, of_instances
+from .primvars import LARGEST, Topology, Unusable, as_values, read_primvar
+from .shapes import Shape, varies
+from .traverse import Placement, told_of
 from .triangulate import Index
 
 MOST = 8_000_000
@@ -59,27 +59,24 @@ def read_dots(prim: Usd.Prim, bound: Bound, tables: Tables) -> Dots | None:
     if len(points) > MOST:
         raise StageError(f"{path}: it has {len(points)} points; at most {MOST} can be rendered")
     for name in ("velocities", "accelerations"):
-        if dots.GetPrim().GetAttribute(name).Get(tables.time):
+        if prim.GetAttribute(name).Get(tables.time):
             told.append(Notice(path, f"{name} are ignored: points are drawn where they are at one time"))
     topology = _topology(len(points))
     try:
-        radii = _radii(dots, len(points), tables)
+        radii = _radii(dots, topology, tables)
     except Unusable as reason:
         told.append(Notice(path, f"skipped: {reason}"))
         return None
-    good = np.isfinite(points).all(axis=1) & (np.abs(points) < LARGEST).all(axis=1) & (radii > 0.0)
-    good &= np.isfinite(radii)
+    good = (np.abs(points) < LARGEST).all(axis=1) & (radii > 0.0) & np.isfinite(radii)
     if not good.all():
         text = f"{int((~good).sum())} of its points are skipped: they have no width above 0, or no finite place"
         told.append(Notice(path, text))
     if not good.any():
         return None
-    part = assemble(prim, _ball(topology), bound, tables)
+    part = assemble(prim, replace(_unit_ball(), topology=topology), bound, tables)
     primvars = {name: v if v.shape[:2] == (1, 1) else v[good, 0] for name, v in part.primvars.items()}
     numbers = np.flatnonzero(good)
-    authored = prim.GetAuthoredPropertyNames()
-    varying = any(name in authored and prim.GetAttribute(name).ValueMightBeTimeVarying() for name in _MOVES)
-    return Dots(part._replace(primvars=primvars), points[good], radii[good], numbers, varying)
+    return Dots(part._replace(primvars=primvars), points[good], radii[good], numbers, varies(prim, _MOVES))
 
 
 def _topology(count: int) -> Topology:
@@ -96,28 +93,24 @@ def _unit_ball() -> Shape:
     )  # fmt: skip
 
 
-def _ball(topology: Topology | None) -> Shape:
-    """The unit sphere; with a topology, as what points have in common."""
-    return _unit_ball() if topology is None else replace(_unit_ball(), topology=topology)
-
-
-def _radii(dots: UsdGeom.Points, count: int, tables: Tables) -> F64:
+def _radii(dots: UsdGeom.Points, topology: Topology, tables: Tables) -> F64:
     """Half the widths, shape (N,).
 
     Raises:
         Unusable: they are not as many as their interpolation asks for.
     """
-    primvar = UsdGeom.PrimvarsAPI(dots.GetPrim()).GetPrimvar("widths")
+    prim, count = dots.GetPrim(), topology.point_count
+    primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("widths")
     if primvar and primvar.HasValue():
-        found = read_primvar(dots.GetPrim(), "widths", tables.time, _topology(count), tables.notices)
+        found = read_primvar(prim, "widths", tables.time, topology, tables.notices)
         if found is None:
             raise Unusable("its primvars:widths cannot be used")
         rows = np.zeros(count, np.int64) if found.rows is None else found.rows[:, 0]
         return found.values[rows, 0].astype(np.float64) / 2.0
     values = as_values(dots.GetWidthsAttr().Get(tables.time))
     if values is None or not len(values):
-        path = str(dots.GetPrim().GetPath())
-        tables.notices.append(Notice(path, f"its points have no widths; they are drawn {WIDTH:g} scene unit wide"))
+        text = f"its points have no widths; they are drawn {WIDTH:g} scene unit wide"
+        tables.notices.append(Notice(str(prim.GetPath()), text))
         return np.full(count, WIDTH / 2.0)
     if len(values) not in (1, count):
         raise Unusable(f"it has {len(values)} widths for {count} points")
@@ -140,22 +133,21 @@ def spread_dots(
         raise StageError(f"{placement.path}: {count * places} points are drawn; at most {MOST} can be rendered")
     matrices = in_metres(placement.worlds, metres_from_stage, np.eye(4), np.zeros(3))
     finite = _stay_near(matrices, dots)
-    lost = [placement.run.path(row) for row in np.flatnonzero(~finite).tolist()]
-    if lost:
-        tables.notices.append(Notice(lost[0], BEYOND if len(lost) == 1 else f"{BEYOND} ({some_of(lost)})"))
-    scales = np.where(finite, even_scales(matrices), -1.0)
     solid = np.abs(np.linalg.det(np.where(finite[:, None, None], matrices[:, :, :3], 0.0))) > 0.0
+    for gone, text in ((~finite, BEYOND), (finite & ~solid, NOTHING_LEFT)):
+        if gone.any():
+            tables.notices.append(told_of([placement.run.path(row) for row in np.flatnonzero(gone).tolist()], text))
+    scales = np.where(solid, even_scales(matrices), -1.0)
     static = placement.static and not dots.varying
     if len(rows := np.flatnonzero(scales > 0.0)):
         paths, centres, primvars = _multiplied(dots, placement.at(rows), matrices[rows], tables)
         radii = (scales[rows, None] * dots.radii).ravel()
         yield Cloud(int(dots.part.materials[0]), static, paths, centres, radii, primvars)
-    if len(rows := np.flatnonzero((scales == 0.0) & solid)):
+    if len(rows := np.flatnonzero(scales == 0.0)):
         paths, centres, primvars = _multiplied(dots, placement.at(rows), matrices[rows], tables)
         linear = (matrices[rows, None, :, :3] * dots.radii[:, None, None]).reshape(-1, 3, 3)
-        materials = np.full(len(_ball(None).triangles), dots.part.materials[0], np.int32)
         same = {name: v for name, v in primvars.items() if v.ndim == 3}
-        part = dots.part._replace(shape=_ball(None), primvars=same, materials=materials)
+        part = dots.part._replace(shape=_unit_ball(), primvars=same)
         values = {name: v for name, v in primvars.items() if v.ndim == 2}
         yield Group(part, static, paths, np.zeros(3), np.concatenate([linear, centres[:, :, None]], axis=2), values)
 

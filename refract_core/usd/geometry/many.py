@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from pxr import Sdf
 
 from ...errors import StageError
-from ...scene import F32, F64, Balls, Instances, Mesh, Notice, Paths
+from ...scene import F32, F64, Balls, Instances, Mesh, Paths
 from .parts import Part, Tables
-from .place import BEYOND, FLAT, LARGEST, NOTHING_LEFT, ROUND, of_instances
-from .primvars import spread
+from .place import BEYOND, FLAT, NOTHING_LEFT, ROUND, of_instances
+from .primvars import LARGEST, spread
 from .shapes import Shape
-from .traverse import Placement, some_of, stays_one
+from .traverse import Placement, stays_one, told_of
 from .triangulate import Index
 
 _FEW_BALLS = 64
@@ -91,11 +91,12 @@ def shared(
     for found in together.values():
         part = parts[found[0][1].prim.GetPath()]
         assert part is not None
-        if _is_ball(part):
+        if part.is_ball:
             if sum(len(placement.worlds) for _, placement in found) < _FEW_BALLS:
                 alone.extend(found)
                 continue
-            found = _clouds(part, found, metres_from_stage, tables, clouds)
+            cloud, found = _cloud(part, found, metres_from_stage, tables)
+            clouds.extend(cloud)
         count = sum(len(placement.worlds) for _, placement in found)
         if not stays_one(count, len(part.shape.triangles)):
             alone.extend(found)
@@ -111,10 +112,6 @@ def shared(
         raise StageError(f"{path}: {text}; at most {MOST_APART} can be rendered. Deactivate some of them")
     every = (placement.at(np.array([row])) for _, placement in alone for row in range(len(placement.worlds)))
     return list(every), groups, clouds
-
-
-def _is_ball(part: Part) -> bool:
-    return part.shape.is_sphere and all(values.shape[:2] == (1, 1) for values in part.primvars.values())
 
 
 def _likeness(part: Part, placement: Placement, tables: Tables) -> Hashable:
@@ -137,51 +134,79 @@ def _group(
     low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     middle, half = (low + high) / 2, (high - low) / 2
     frame = metres_from_stage, part.shape.prim_from_shape, middle
-    runs, matrices, left = [], [], []
+    finite, sense = _judged(_worlds([placement for _, placement in found]), frame, half)
+    runs, rest = _parted(found, finite & (sense != 0))
+    left = []
     lost: list[str] = []
     gone: list[str] = []
-    for number, placement in found:
-        finite, sense = _judged(placement.worlds, frame, half)
-        lost += [placement.run.path(row) for row in np.flatnonzero(~finite).tolist()]
-        flat = np.flatnonzero(finite & (sense == 0))
-        sheets = _rank(in_metres(placement.worlds[flat], *frame)) > 1
-        gone += [placement.run.path(row) for row in flat[~sheets].tolist()]
+    for number, placement in rest:
+        sheets, _ = _judged(placement.worlds, frame, half)
+        lost += [placement.run.path(row) for row in np.flatnonzero(~sheets).tolist()]
+        flat = np.flatnonzero(sheets)
+        sheets[flat] = _rank(in_metres(placement.worlds[flat], *frame)) > 1
+        gone += [placement.run.path(row) for row in flat[~sheets[flat]].tolist()]
         if sheets.any():
-            left.append((number, placement.at(flat[sheets])))
-        kept = np.flatnonzero(finite & (sense != 0))
-        if len(kept):
-            runs.append(placement if len(kept) == len(finite) else placement.at(kept))
-            matrices.append(in_metres(runs[-1].worlds, *frame, over=True))
+            left.append((number, placement.at(np.flatnonzero(sheets))))
     for paths, text in ((lost, BEYOND), (gone, NOTHING_LEFT)):
         if paths:
-            tables.notices.append(Notice(paths[0], text if len(paths) == 1 else f"{text} ({some_of(paths)})"))
+            tables.notices.append(told_of(paths, text))
     if not runs:
         return [], left
-    primvars = of_instances(part, runs[0], tables) if len(runs) == 1 else {}
-    where = matrices[0] if len(matrices) == 1 else np.concatenate(matrices)
+    static = runs[0].static and not part.shape.varying
+    where = in_metres(_worlds(runs), *frame, over=True)
     where_drawn = Paths(tuple(placement.paths for placement in runs))
-    return [Group(part, runs[0].static and not part.shape.varying, where_drawn, middle, where, primvars)], left
+    return [Group(part, static, where_drawn, middle, where, _said(part, runs, tables))], left
 
 
-def _clouds(
-    part: Part, found: list[tuple[int, Placement]], metres_from_stage: F64, tables: Tables, clouds: list[Cloud]
-) -> list[tuple[int, Placement]]:
-    """Adds the places in which a sphere stays one; returns the others."""
-    left = []
+def _cloud(
+    part: Part, found: list[tuple[int, Placement]], metres_from_stage: F64, tables: Tables
+) -> tuple[list[Cloud], list[tuple[int, Placement]]]:
+    """One record of the places in which a sphere stays one, and the others."""
+    worlds = _worlds([placement for _, placement in found])
+    matrices = in_metres(worlds, metres_from_stage, part.shape.prim_from_shape, np.zeros(3))
+    radii = even_scales(matrices)
+    kept = (radii > 0.0) & (radii + np.abs(matrices[:, :, 3]).max(axis=1) < LARGEST)
+    runs, left = _parted(found, kept)
+    if not runs:
+        return [], left
+    static = runs[0].static and not part.shape.varying
+    paths = Paths(tuple(placement.paths for placement in runs))
+    primvars = part.primvars | _said(part, runs, tables)
+    centres = np.ascontiguousarray(matrices[kept, :, 3])
+    return [Cloud(int(part.materials[0]), static, paths, centres, radii[kept], primvars)], left
+
+
+def _worlds(placements: list[Placement]) -> F64:
+    """All places of several; of one, the array itself."""
+    if len(placements) == 1:
+        return placements[0].worlds
+    return np.concatenate([placement.worlds for placement in placements])
+
+
+def _parted(
+    found: list[tuple[int, Placement]], kept: NDArray[np.bool_]
+) -> tuple[list[Placement], list[tuple[int, Placement]]]:
+    """Placements cut down to the places that are kept, and to the others. `kept`: shape (N,), of all places."""
+    if kept.all():
+        return [placement for _, placement in found], []
+    runs, rest, start = [], [], 0
     for number, placement in found:
-        matrices = in_metres(placement.worlds, metres_from_stage, part.shape.prim_from_shape, np.zeros(3))
-        radii = even_scales(matrices)
-        kept = (radii > 0.0) & (radii + np.abs(matrices[:, :, 3]).max(axis=1) < LARGEST)
-        rows = np.flatnonzero(kept)
-        if len(rows):
-            some = placement if kept.all() else placement.at(rows)
-            primvars = part.primvars | of_instances(part, some, tables)
-            static = placement.static and not part.shape.varying
-            centres = np.ascontiguousarray(matrices[rows, :, 3])
-            clouds.append(Cloud(int(part.materials[0]), static, Paths((some.paths,)), centres, radii[rows], primvars))
-        if not kept.all():
-            left.append((number, placement.at(np.flatnonzero(~kept))))
-    return left
+        here = kept[start : start + len(placement.worlds)]
+        start += len(here)
+        if here.any():
+            runs.append(placement if here.all() else placement.at(np.flatnonzero(here)))
+        if not here.all():
+            rest.append((number, placement.at(np.flatnonzero(~here))))
+    return runs, rest
+
+
+def _said(part: Part, runs: list[Placement], tables: Tables) -> dict[str, F32]:
+    """What the instancer says of all places of placements that are alike, which have the same one or none."""
+    instance = runs[0].instance
+    if instance is None:
+        return {}
+    numbers = np.concatenate([placement.instance[1] for placement in runs if placement.instance is not None])
+    return of_instances(part, runs[0]._replace(instance=(instance[0], numbers)), tables)
 
 
 def even_scales(matrices: F64) -> F64:

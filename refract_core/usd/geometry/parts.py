@@ -17,7 +17,7 @@ from .curves import Cut
 from .primvars import as_values, read_primvar, spread
 from .refined import Fineness
 from .shapes import Shape
-from .traverse import Placement, some_of, stays_one
+from .traverse import Placement, stays_one, told_of
 
 MOST_IN_ALL = 4_000_000
 """Triangles that the subdivision surfaces of a stage have together, counted wherever they are drawn, but once where an
@@ -63,6 +63,11 @@ class Part(NamedTuple):
     wanted: frozenset[str]
     """Names its materials read, whether it has them or not."""
 
+    @property
+    def is_ball(self) -> bool:
+        """An exact sphere wherever a transform leaves it round: all that is said of it holds everywhere on it."""
+        return self.shape.is_sphere and all(values.shape[:2] == (1, 1) for values in self.primvars.values())
+
 
 def affordable(placements: Sequence[Placement], time: Usd.TimeCode, fineness: Fineness) -> Fineness:
     """As fine as subdivision surfaces may be for all of a stage to have `MOST_IN_ALL` triangles of them."""
@@ -104,7 +109,7 @@ def bind(prims: Sequence[Usd.Prim], notices: list[Notice]) -> list[Bound]:
             broken.setdefault(targets, []).append(str(prim.GetPath()))
     for targets, paths in broken.items():
         text = f"the bound material {targets} does not exist or is no Material; displayColor is used"
-        notices.append(Notice(paths[0], f"{text} ({some_of(paths)})" if len(paths) > 1 else text))
+        notices.append(told_of(paths, text))
     rest = iter(materials[len(prims) :])
     return [
         Bound(material, tuple((subset, next(rest)) for subset in group))

@@ -9,11 +9,10 @@ import numpy as np
 
 from ...scene import F32, F64, Mesh, Notice, Sphere
 from .parts import Part, Tables, instance_values
-from .primvars import Corners, spread
+from .primvars import LARGEST, Corners, spread
 from .traverse import Placement
 from .triangulate import has_area, turned_over
 
-LARGEST = 1.0e15
 FLAT = 1.0e-12
 """Volume of a transformed cube, relative to its edges, under which the transform flattens."""
 BEYOND = "skipped: its transform is not finite or takes it beyond 1e15 m"
@@ -48,7 +47,7 @@ def place(part: Part, placement: Placement, metres_from_stage: F64, tables: Tabl
     matrix = metres_from_stage @ _square(placement.worlds[0]) @ part.shape.prim_from_shape
     linear, origin = matrix[:3, :3], matrix[:3, 3]
     extra = _of_instance(part, placement, tables)
-    if part.shape.is_sphere and all(values.shape[:2] == (1, 1) for values in part.primvars.values()):
+    if part.is_ball:
         radius = uniform_scale(linear)
         if 0.0 < radius < LARGEST and np.abs(origin).max() < LARGEST:
             return Placed(part, placement, origin[None], linear, 1, extra, radius)

@@ -13,6 +13,8 @@ from ...scene import F32, Notice
 from .triangulate import Index, turned_over
 
 CHANNELS = 4
+LARGEST = 1.0e15
+"""Coordinates and lengths beyond it are taken for garbage: their squares still fit float32."""
 WHOLE = "elementSize is the number of all values, as some exporters write it, which would be one element; 1 is used"
 """Said of a prim whose primvar has that mistake."""
 

@@ -24,7 +24,7 @@ from .cages import (
     steps_of,
     without_repeats,
 )
-from .primvars import WHOLE, Corners, Topology, Unusable, as_values, evaluate, to_corners
+from .primvars import LARGEST, WHOLE, Corners, Topology, Unusable, as_values, evaluate, to_corners
 from .refined import Fineness, surface
 from .traverse import CURVES
 from .triangulate import (
@@ -44,8 +44,6 @@ TURN = "turn its orientation attribute round, or reverse its faces"
 """What to do about it."""
 _MESH_ATTRIBUTES = ("points", "faceVertexCounts", "faceVertexIndices", "holeIndices", "normals")
 _HIDDEN = ", or touch a boundary and interpolateBoundary is none, or have no area"
-_LARGEST = 1.0e15
-"""Coordinates beyond it are taken for garbage: their squares still fit float32."""
 _IDENTITY = np.eye(4)
 _SMALL = 512
 """Face corners up to which a topology is kept: many small meshes are the same few shapes."""
@@ -134,7 +132,8 @@ def read_shape(
     return shape
 
 
-def _varies(prim: Usd.Prim, names: tuple[str, ...]) -> bool:
+def varies(prim: Usd.Prim, names: tuple[str, ...]) -> bool:
+    """Whether any of these attributes may be another one at another time."""
     authored = prim.GetAuthoredPropertyNames()
     return any(name in authored and prim.GetAttribute(name).ValueMightBeTimeVarying() for name in names)
 
@@ -150,7 +149,7 @@ def _read_gprim(prim: Usd.Prim, time: Usd.TimeCode) -> Shape:
         prim_from_shape=gprim.prim_from_solid,
         closed=gprim.solid.closed,
         double_sided=bool(UsdGeom.Gprim(prim).GetDoubleSidedAttr().Get(time)),
-        varying=_varies(prim, gprims.ATTRIBUTES[prim.GetTypeName()]),
+        varying=varies(prim, gprims.ATTRIBUTES[prim.GetTypeName()]),
         is_sphere=gprim.is_sphere,
     )
 
@@ -167,7 +166,7 @@ def _read_curves(
         topology=drawn.topology,
         closed=drawn.round,
         double_sided=not drawn.round,
-        varying=_varies(prim, curves.ATTRIBUTES),
+        varying=varies(prim, curves.ATTRIBUTES),
     )
 
 
@@ -255,7 +254,7 @@ def _read_mesh(mesh: UsdGeom.Mesh, time: Usd.TimeCode, notices: list[Notice], *,
         closed=(known is not None and known.closed)
         or is_closed(faces.points, faces.indices, faces.starts, faces.counts),
         double_sided=bool(mesh.GetDoubleSidedAttr().Get(time)),
-        varying=_varies(mesh.GetPrim(), _MESH_ATTRIBUTES),
+        varying=varies(mesh.GetPrim(), _MESH_ATTRIBUTES),
         cage=cage,
     )
 
@@ -300,7 +299,7 @@ def _read_surface(mesh: UsdGeom.Mesh, time: Usd.TimeCode, notices: list[Notice],
         topology=Topology(corners, vertices, of_triangle, *size, made.refinement),
         closed=made.closed or _closes(made.corners, last.vertices, points),
         double_sided=bool(mesh.GetDoubleSidedAttr().Get(time)),
-        varying=_varies(mesh.GetPrim(), (*_MESH_ATTRIBUTES, *SUBDIVISION_ATTRIBUTES)),
+        varying=varies(mesh.GetPrim(), (*_MESH_ATTRIBUTES, *SUBDIVISION_ATTRIBUTES)),
         subdivided=True,
         coarse=steps < fineness.steps,
     )
@@ -381,7 +380,7 @@ def _usable_faces(mesh: UsdGeom.Mesh, time: Usd.TimeCode, *, surface: bool = Fal
     wrong = (indices < 0) | (indices >= len(values))
     outside = _any_of_face(wrong, starts, counts)
     _exclude(usable, ~outside, f"faces with indices outside 0 .. {len(values) - 1}", faults)
-    wild = ~np.all(np.abs(values) <= _LARGEST, axis=1)
+    wild = ~np.all(np.abs(values) <= LARGEST, axis=1)
     if wild.any():
         bad = _any_of_face(wild[np.where(wrong, 0, indices)], starts, counts)
         _exclude(usable, ~bad, "faces with points that are NaN, infinite or over 1e15", faults)
@@ -403,8 +402,8 @@ def _sound(points: F32, indices: Index) -> bool:
 
 
 def _tame(points: F32) -> bool:
-    """No NaN, no infinity, nothing beyond `_LARGEST`."""
-    return bool(points.min() >= -_LARGEST and points.max() <= _LARGEST)
+    """No NaN, no infinity, nothing beyond `LARGEST`."""
+    return bool(points.min() >= -LARGEST and points.max() <= LARGEST)
 
 
 def _exclude(usable: NDArray[np.bool_], good: NDArray[np.bool_], why: str, faults: dict[str, int]) -> None:

@@ -156,6 +156,11 @@ def some_of(paths: list[str]) -> str:
     return f"{len(paths)} prim{'s' if len(paths) > 1 else ''}: {first}"
 
 
+def told_of(paths: list[str], text: str) -> Notice:
+    """What is said of all of these alike, at the first of them."""
+    return Notice(paths[0], f"{text} ({some_of(paths)})" if len(paths) > 1 else text)
+
+
 def _descend(
     state: _Walk, start: _Node, predicate: Usd._PrimFlagsPredicate, cut: int, *, placed: bool = False
 ) -> Iterator[Placement]:

@@ -64,6 +64,16 @@ def files_of(path: str) -> list[str]:
         return _on_disk([path])
 
 
+def documentation(path: str) -> str:
+    """What a layer says of itself; '' where it says nothing or cannot be read."""
+    with captured():
+        try:
+            layer = Sdf.Layer.FindOrOpen(path)
+        except Tf.ErrorException:
+            return ""
+    return str(layer.documentation) if layer else ""
+
+
 def _on_disk(paths: list[str]) -> list[str]:
     files = {os.path.abspath(outer_of(path)) for path in paths if path}
     return sorted(file for file in files if os.path.isfile(file))

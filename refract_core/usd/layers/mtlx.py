@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 from pxr import Ar, Gf, Sdf, Tf, Usd
 
 from ...errors import StageError, UsageError
+from ..values import free_name
 from .mtlx_file import LARGEST, Document, Graph, Node, Port, Unreadable, load_library, read_document
 
 EXTENSION = ".mtlx"
@@ -309,11 +310,7 @@ def _material(
 
 def _free(name: str, parent: Sdf.PrimSpec) -> str:
     """A valid name that no child has."""
-    base = Tf.MakeValidIdentifier(name)
-    unique, count = base, 1
-    while unique in parent.nameChildren:
-        unique, count = f"{base}_{count}", count + 1
-    return unique
+    return free_name(Tf.MakeValidIdentifier(name), parent.nameChildren)
 
 
 def _kind(port: Port) -> Sdf.ValueTypeName:

@@ -43,7 +43,7 @@ def check_out(
         StageError: the folder is missing or cannot be written.
     """
     if os.path.splitext(out)[1].lower() not in extensions:
-        raise UsageError(f"{out}: is not the name of a USD file; end it with one of {', '.join(EXTENSIONS)}")
+        raise UsageError(f"OUT '{out}' has no extension that is known; end it with one of {', '.join(extensions)}")
     check_place(out, StageError)
     if not os.path.lexists(out):
         return

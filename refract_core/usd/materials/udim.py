@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...errors import ImageError
 from ...images import codec
-from ...images.srgb import srgb_decode, srgb_encode
+from ...images.srgb import linear_pixels, srgb_encode
 from ...scene import Source, Texture, Wrap
 from ..values import short
 from .coordinates import Matrix, compose
@@ -168,9 +168,7 @@ def _alike(tile: Texture, as_bytes: bool, srgb: bool) -> NDArray[Any]:
     """A tile's pixels as all of them are kept: a grey one beside coloured ones may have another curve."""
     if tile.pixels.dtype == np.uint8 and as_bytes and tile.srgb == srgb:
         return tile.pixels
-    out = tile.pixels.astype(np.float32) / (255.0 if tile.pixels.dtype == np.uint8 else 1.0)
-    if tile.srgb:
-        out[..., :3] = srgb_decode(out[..., :3])
+    out = linear_pixels(tile)
     if not as_bytes:
         return out
     if srgb:
