@@ -119,12 +119,13 @@ def test_every_block_says_what_it_is() -> None:
 
 @pytest.fixture
 def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with the samples in it, and a stage with a time range under the name that pages use."""
+    """A folder with the samples in it, a stage with a time range under the name that pages use, and a sky."""
     (tmp_path / "usd_samples").symlink_to(ROOT / "usd_samples", target_is_directory=True)
     for part in ("parts", "textures"):
         (tmp_path / part).symlink_to(ROOT / "usd_samples" / "good" / part, target_is_directory=True)
     for stage, sample in (("stage.usda", "two_probes"), ("table.usda", "planar_table")):
         (tmp_path / stage).write_text((ROOT / "usd_samples" / "good" / f"{sample}.usda").read_text("utf-8"), "utf-8")
+    shutil.copy(ROOT / "usd_samples" / "good" / "textures" / "studio.exr", tmp_path / "sky.exr")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -204,5 +205,5 @@ def test_a_block_that_asks_the_service_runs(block: Block, desk: Path, server: Se
     variables = {**os.environ, "PYTHONPATH": str(ROOT), "no_proxy": "*"}
     done = subprocess.run(["bash", "-c", script], cwd=desk, env=variables, capture_output=True, timeout=1800)
     assert done.returncode == 0, f"{block.text}\n{(done.stdout + done.stderr).decode('utf-8', 'replace')}"
-    for file in re.findall(r"-o (\S+\.(?:png|exr|usdz))", block.text):
+    for file in re.findall(r"-o ([^\s\"$]+\.(?:png|exr|usdz))", block.text):
         assert (desk / file).stat().st_size > 500, file

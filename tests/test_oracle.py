@@ -52,7 +52,7 @@ def settings_of(seed: int) -> rc.RenderSettings:
     chosen["screen"] = "proxy" if seed % 13 == 6 else "traced"
     chosen["exposure"] = 1.0 if seed % 17 == 8 else 0.0
     chosen["model"] = {9: "box", 10: "traced", 11: "thin", 12: "sphere", 13: "single"}.get(seed % 19, "")
-    return rc.RenderSettings(image_width=WIDTH, image_height=HEIGHT, tolerance=0.0, **ALONE, **chosen)
+    return rc.RenderSettings(image_width=WIDTH, image_height=HEIGHT, tolerance=0.0, studio="none", **ALONE, **chosen)
 
 
 def scene_of(seed: int) -> Scene:
@@ -204,7 +204,7 @@ def test_a_present_share_is_the_same_share_everywhere(opacity: float) -> None:
     there = material("/wall", EMISSIVE=(0.7, 0.1, 0.3))
     lens = camera((0.2, 0.3, 2.4), aspect=4 / 3)
     what = scene([card, wall], [here, there], cameras=(lens,))
-    settings = rc.RenderSettings(image_width=24, image_height=18, samples=1, tiers=("ray",), **ALONE)
+    settings = rc.RenderSettings(image_width=24, image_height=18, samples=1, tiers=("ray",), studio="none", **ALONE)
     wrong, excused = compare(what, settings, 24, 18)
     assert not wrong, "\n".join(wrong[:12])
     assert excused <= 24 * 18 / 50
@@ -221,7 +221,7 @@ def test_steep_normals_send_no_ray_to_the_wrong_side(seed: int) -> None:
     far = with_bent_normals(box("/far", (0.5, 0.5, 0.5), 2, turned((3, 1, 2), 50), (-0.3, 0, 0)), 1.0, rng)
     glasses = [glass(Model.TRACED, 1.0), glass(Model.TRACED, 1.08)]
     what = scene([*walls, slab, near, far], [*materials, *glasses], cameras=(camera((0, 0.3, 2.6), aspect=4 / 3),))
-    settings = rc.RenderSettings(image_width=24, image_height=18, samples=1, tiers=("ray",), **ALONE)
+    settings = rc.RenderSettings(image_width=24, image_height=18, samples=1, tiers=("ray",), studio="none", **ALONE)
     wrong, excused = compare(what, settings, 24, 18)
     assert not wrong, f"{len(wrong)} differences, among them\n" + "\n".join(wrong[:12])
     assert excused <= 24 * 18 / 50

@@ -310,7 +310,8 @@ def test_a_browser_gets_what_it_likes_best(client: httpx.Client) -> None:
 
 def over_black(rgba: Any) -> Any:
     """Colours, shape (H, W, 3), in [0, 1]: where a picture is transparent they may be anything."""
-    return rgba[..., :3] / 255.0 * (rgba[..., 3:] / 255.0)
+    alpha = rgba[..., 3:] / 255.0 if rgba.shape[-1] == 4 else 1.0  # some readers leave out one that is full
+    return rgba[..., :3] / 255.0 * alpha
 
 
 # --- several pictures in one job

@@ -559,7 +559,7 @@ def test_an_exception_in_a_worker_is_a_fault_of_ours(monkeypatch: pytest.MonkeyP
     ]
     for error, slug in known:
 
-        def fail(_job: Any, _say: Any, error: BaseException = error) -> Any:
+        def fail(*_: Any, error: BaseException = error) -> Any:
             raise error
 
         monkeypatch.setattr(worker, "_perform", fail)

@@ -81,8 +81,11 @@ def prepared(jobs: list[str]) -> Iterator[None]:
     def before_call(context: Any, case: Any, kwargs: Any) -> None:
         if not case.meta or case.meta.generation.mode.value != "positive":
             return
+        if any(part.mode.value != "positive" for part in case.meta.components.values()):
+            return
         case.headers = {**(case.headers or {}), **dice.choice(HEADERS)}
-        if "identifier" in case.path_parameters and dice.random() < 0.75:
+        of_a_job = "identifier" in case.path_parameters and not case.operation.path.startswith("/v1/live")
+        if of_a_job and dice.random() < 0.75:
             case.path_parameters["identifier"] = dice.choice(jobs)
             if "name" in case.path_parameters:
                 case.path_parameters["name"] = "Z"

@@ -185,15 +185,15 @@ def test_front_is_where_the_bottom_of_the_picture_is(height: float) -> None:
 
 @pytest.mark.parametrize("studio", STUDIOS)
 def test_nobody_sees_where_the_floor_ends(studio: str) -> None:
-    """At its rim it looks as the lower half of the dome, which is what one sees past it; but for what a narrow box
-    loses in the coarse map of a dome's irradiance."""
+    """At its rim it looks as the lower half of the dome, which is what one sees past it, where the thing's own shadow
+    does not fall; but for what a narrow box loses in the coarse map of a dome's irradiance."""
     speck = scene([], [material("/red", DIFFUSE=RED)], [replace(BALL, radius=0.01)])
     rim = camera((0.079, 0.5, 0.0), (0.079, 0.0, 0.0), fov=1e-4)
-    what = replace(with_studio(speck, camera((0, 0, 1)), studio), cameras=(rim,))
+    what = replace(with_studio(speck, camera((0, 0, 1)), studio), cameras=(rim,), spheres=())
     planes = draw(what, 9, 9, light_samples=256, samples=64, tolerance=0.0)
     assert (planes["Z"] < np.inf).all()
     below = dome_of(studio)[-1, 0]
-    np.testing.assert_allclose(planes["beauty"][..., :3].mean((0, 1)), below, rtol=0.02)
+    np.testing.assert_allclose(planes["beauty"][..., :3].mean((0, 1)), below, rtol=0.01)
 
 
 @pytest.mark.parametrize("studio", STUDIOS)
