@@ -28,6 +28,7 @@ _FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 # What a page may ask a reader to type that `.ci/run`, the benchmarks or a fixture do, not these tests.
 _ELSEWHERE = (
     "refract serve",
+    "python3 -m venv",
     "pip install",
     "pytest",
     ".ci/run",

@@ -177,6 +177,20 @@ def test_strict_lets_warnings_fail_in_every_form(stage: Path, strict: bool, code
 # --- forms ----------------------------------------------------------------------------------------------------------
 
 
+def test_an_asset_without_a_camera_is_not_at_fault(tmp_path: Path) -> None:
+    """It stands in other stages, which have theirs. What is wrong with it is told as ever."""
+    asset = tmp_path / "asset.usda"
+    asset.write_text(
+        """#usda 1.0
+        ( defaultPrim = "A" metersPerUnit = 1 upAxis = "Y" )
+        def Xform "A" ( kind = "component" ) { def Sphere "S" { float3[] extent = [(-1, -1, -1), (1, 1, 1)] } }
+        """
+    )
+    assert refract(asset, "--strict").exit_code == 0
+    asset.write_text(asset.read_text().replace("{ def", "{ float refraction:ior = 2 \n def"))
+    assert refract(asset, "--strict").exit_code == 1
+
+
 def test_json_by_either_name_is_the_same() -> None:
     assert refract(ERRS, "--json").stdout == refract(ERRS, "--format", "json").stdout
 

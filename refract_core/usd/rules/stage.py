@@ -42,8 +42,10 @@ def scene_findings(stage: Usd.Stage) -> list[Finding]:
     """What is found once the stage is read as a renderer does; see `value_findings` for what needs no reading."""
     values, found = value_findings(stage), [*name_findings(stage), *fallback_findings(stage)]
     other = readable(stage, values)
+    # An asset without a camera is as it should be: it stands in other stages.
+    asset = not any(prim.IsA(UsdGeom.Camera) for prim in other.Traverse())
     try:
-        scene = scene_from_stage(other)
+        scene = scene_from_stage(other, orbits=asset)
     except StageError as error:
         return [*found, UNREADABLE.broken(stage.GetRootLayer().identifier, str(error))]
     glass = glass_of(scene)
