@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from functools import lru_cache
 
-from pxr import Tf, Usd, UsdGeom
+from pxr import Tf, Usd, UsdGeom, UsdLux
 
 from ...errors import StageError
 from ...scene import Notice, Scene
@@ -42,8 +42,8 @@ def scene_findings(stage: Usd.Stage) -> list[Finding]:
     """What is found once the stage is read as a renderer does; see `value_findings` for what needs no reading."""
     values, found = value_findings(stage), [*name_findings(stage), *fallback_findings(stage)]
     other = readable(stage, values)
-    # An asset without a camera is as it should be: it stands in other stages.
-    asset = not any(prim.IsA(UsdGeom.Camera) for prim in other.Traverse())
+    # An asset stands in other stages, which have the camera and the light.
+    asset = not any(prim.IsA(UsdGeom.Camera) or prim.HasAPI(UsdLux.LightAPI) for prim in other.Traverse())
     try:
         scene = scene_from_stage(other, orbits=asset)
     except StageError as error:
