@@ -182,15 +182,22 @@ def test_an_asset_without_a_camera_is_not_at_fault(tmp_path: Path) -> None:
     asset = tmp_path / "asset.usda"
     asset.write_text(
         """#usda 1.0
-        ( defaultPrim = "A" metersPerUnit = 1 upAxis = "Y" )
-        def Xform "A" ( kind = "component" ) {
-            def Sphere "S" { float3[] extent = [(-1, -1, -1), (1, 1, 1)]
+        (
+            defaultPrim = "A"
+            metersPerUnit = 1
+            upAxis = "Y"
+        )
+        def Xform "A" (kind = "component")
+        {
+            def Sphere "S"
+            {
+                float3[] extent = [(-1, -1, -1), (1, 1, 1)]
             }
         }
         """
     )
     assert refract(asset, "--strict").exit_code == 0
-    asset.write_text(asset.read_text().replace('"component" ) {', '"component" ) { float refraction:ior = 2'))
+    asset.write_text(asset.read_text().replace("float3[]", "float refraction:ior = 2\nfloat3[]"))
     assert refract(asset, "--strict").exit_code == 1
 
 
