@@ -4,6 +4,7 @@ forms and quadrature in plain numpy."""
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +19,7 @@ from refract_core.scene import Channel, Light, LightKind, Material, Mesh, Model,
 from refract_core.world import environment, textures
 from refract_core.world.emitters import what_glows
 from refract_core.world.lamps import pack_lights
-from refract_core.world.lights import irradiance_factor, shadow_ray
+from refract_core.world.lights import highlight, irradiance_factor, shadow_ray
 from refract_core.world.tables import pack_geometry, pack_materials, world_of
 
 pytestmark = pytest.mark.draws
@@ -87,6 +88,46 @@ def test_inside_of_what_glows_all_that_is_convex_is_its_albedo(shape: str) -> No
     what = scene(meshes, [WHITE, GLOW], [*balls, Sphere("/thing", (0, 0, 0), 0.9, 0)], cameras=(lens,))
     seen = floor(what)[16:32, 16:32]
     np.testing.assert_allclose(seen, np.broadcast_to(0.8 * np.array([4.0, 2.0, 1.0]), seen.shape), rtol=0.02)
+
+
+def albedo_of_lobe(alpha: float, cosine: float) -> float:
+    """What a GGX surface without Fresnel sends back of light from everywhere: the lobe over the hemisphere."""
+    wo = np.array([math.sqrt(1.0 - cosine**2), 0.0, cosine])
+    up, turn = ((np.arange(k) + 0.5) / k for k in (400, 800))
+    z, phi = np.meshgrid(up, 2.0 * math.pi * turn)
+    wi = np.stack([np.sqrt(1.0 - z**2) * np.cos(phi), np.sqrt(1.0 - z**2) * np.sin(phi), z], axis=-1).reshape(-1, 3)
+    return float(lobe(wi, np.array([0.0, 0.0, 1.0]), wo, alpha).mean() * 2.0 * math.pi)
+
+
+@pytest.mark.parametrize("roughness", [0.55, 0.9])
+@pytest.mark.parametrize("shape", ["box", "ball"])
+def test_inside_of_what_glows_a_rough_metal_shines_by_its_lobe(shape: str, roughness: float) -> None:
+    """It has no diffuse light; and it sends no mirror rays, which would see the room."""
+    room: Mesh | Sphere = box("/room", (3, 2, 4), 1) if shape == "box" else Sphere("/room", (0.2, 0.1, 0.0), 5.0, 1)
+    meshes = [room] if isinstance(room, Mesh) else []
+    balls = [] if isinstance(room, Mesh) else [room]
+    lens = camera((0, 0, 2), (0, 0, 0), 0.1)
+    metal = material("/metal", DIFFUSE=(1.0, 1.0, 1.0), METALLIC=1.0, ROUGHNESS=roughness)
+    what = scene(meshes, [metal, GLOW], [*balls, Sphere("/thing", (0, 0, 0), 0.9, 0)], cameras=(lens,))
+    seen = floor(what)[20:28, 20:28]
+    expected = albedo_of_lobe(roughness**2, 1.0) * np.array([4.0, 2.0, 1.0])
+    np.testing.assert_allclose(seen, np.broadcast_to(expected, seen.shape), rtol=0.03)
+
+
+def test_a_metal_between_smooth_and_rough_has_the_highlight_once_and_no_specks() -> None:
+    """Its mirror rays see the rest of the room, and would meet a small thing that glows now and then."""
+    lens = camera((0, 0, 2), (0, 0, 0), 0.4)
+    room = quad("/room", [(-50, -50, -2), (50, -50, -2), (50, 50, -2), (-50, 50, -2)], 0)
+    spot = quad("/spot", [(-0.3, 0.2, 3.0), (-0.3, 0.8, 3.0), (0.3, 0.8, 3.0), (0.3, 0.2, 3.0)], 2)
+    shown = {}
+    for roughness in (0.499, 0.501):
+        metal = material("/metal", DIFFUSE=(1.0, 1.0, 1.0), METALLIC=1.0, ROUGHNESS=roughness)
+        what = scene([room, spot], [WHITE, metal, GLOW], [Sphere("/thing", (0, 0, 0), 0.9, 1)], cameras=(lens,))
+        shown[roughness] = floor(what, samples=16)[14:34, 14:34, 0]
+    smooth, rough = shown[0.499], shown[0.501]
+    assert rough.max() > 0.05
+    assert smooth.mean() == pytest.approx(rough.mean(), rel=0.15)
+    np.testing.assert_allclose(smooth, rough, atol=0.05 * rough.max())
 
 
 def test_a_closed_body_shines_outwards_and_a_sheet_both_ways() -> None:
@@ -190,6 +231,31 @@ def _ask(lights, points, normals, draws, out, to):  # type: ignore[no-untyped-de
                 to[k, i, c] = p[c] + distance * direction[c]
 
 
+@kernel
+def _ask_gleam(lights, points, normals, views, alphas, mirrors, out):  # type: ignore[no-untyped-def]
+    for k in range(points.shape[0]):
+        p, n = (points[k, 0], points[k, 1], points[k, 2]), (normals[k, 0], normals[k, 1], normals[k, 2])
+        wo = (views[k, 0], views[k, 1], views[k, 2])
+        for l in range(lights.kind.shape[0]):  # noqa: E741
+            share = highlight(lights, l, p, n, wo, alphas[k], mirrors)
+            for c in range(3):
+                out[k, c] += share * lights.radiance[l, c]
+
+
+def lobe(wi: F64, n: F64, wo: F64, alpha: float) -> F64:
+    """GGX with Smith's height-correlated shadowing (Heitz 2014, equations 71, 72 and 99), times the cosine, without
+    Fresnel [1 / sr]."""
+    h = wi + wo
+    h /= np.maximum(np.linalg.norm(h, axis=-1, keepdims=True), 1e-12)
+    l, v, m = wi @ n, wo @ n, h @ n  # noqa: E741
+    d = alpha**2 / (math.pi * np.square(m * m * (alpha**2 - 1.0) + 1.0))
+    def wide(x: Any) -> Any:
+        return np.sqrt(alpha**2 + (1.0 - alpha**2) * x * x)
+    up = np.maximum(l, 1e-12)
+    result: F64 = np.where(l > 0.0, d * up * 0.5 / (up * wide(v) + v * wide(up)), 0.0)
+    return result
+
+
 def table_of(what: Scene, eye: Any = (0.0, 0.0, 60.0)) -> Any:
     """The light table with what glows in it."""
     geometry, bvh, slots = pack_geometry(what)
@@ -201,8 +267,9 @@ def table_of(what: Scene, eye: Any = (0.0, 0.0, 60.0)) -> Any:
     return table
 
 
-def arrives(corners: F64, radiance: F64, point: F64, normal: F64, count: int = 24) -> F64:
-    """Irradiance of triangles that shine to the side from which they run counter-clockwise, by quadrature."""
+def arrives(corners: F64, radiance: F64, point: F64, worth: Callable[[F64], F64], count: int = 24) -> F64:
+    """What triangles bring that shine to the side from which they run counter-clockwise, where a direction (unit, ...)
+    is worth so much per solid angle, by quadrature."""
     s = (np.arange(count) + 0.5) / count
     u, v = (grid.ravel() for grid in np.meshgrid(np.sqrt(s), s))
     a, b, c = (corners[:, k, None] for k in range(3))
@@ -211,7 +278,7 @@ def arrives(corners: F64, radiance: F64, point: F64, normal: F64, count: int = 2
     to = places - point
     d2 = np.square(to).sum(2)
     facing = np.maximum(0.0, -np.einsum("tqc,tc->tq", to, across)) / 2.0
-    result: F64 = (np.maximum(0.0, to @ normal) * facing / d2**2).mean(1) @ radiance
+    result: F64 = (worth(to / np.sqrt(d2)[..., None]) * facing / d2**1.5).mean(1) @ radiance
     return result
 
 
@@ -249,7 +316,9 @@ def test_what_arrives_of_any_triangles(seed: int) -> None:
     s = (np.arange(16) + 0.5) / 16
     draws = np.stack([grid.ravel() for grid in np.meshgrid(s, s)], axis=1)
     _ask(Pointer(table), points, normals, draws, found, to)
-    expected = np.array([arrives(corners, radiance, p, n) for p, n in zip(points, normals, strict=True)])
+    expected = np.array(
+        [arrives(corners, radiance, p, lambda d: np.maximum(0.0, d @ n)) for p, n in zip(points, normals, strict=True)]  # noqa: B023
+    )
     near = expected.sum(1) > 0.02 * expected.sum(1).max()
     np.testing.assert_allclose(found[near], expected[near], rtol=0.03)
     assert np.abs(found - expected).mean() < 0.005 * expected.mean()
@@ -257,3 +326,35 @@ def test_what_arrives_of_any_triangles(seed: int) -> None:
     middle, half = (corners.max(1) + corners.min(1)) / 2, (corners.max(1) - corners.min(1)) / 2 + 1e-4
     k = int(expected.sum(1).argmax())
     assert (np.abs(to[k][:, None] - middle) <= half).all(2).any(1).all()
+
+
+@pytest.mark.parametrize("alpha", [0.05, 0.15, 0.4, 0.9])
+@pytest.mark.parametrize("seed", range(6))
+def test_the_highlight_of_any_triangles(seed: int, alpha: float) -> None:
+    """On rough surfaces of any place, direction and roughness; those that mirror the scene have none. Where one looks
+    along the surface the lobe is narrow across, and is not held to this."""
+    what, corners, radiance = soup(seed)
+    rng = np.random.default_rng(2000 + seed)
+    points = rng.uniform(-3.0, 3.0, (20, 3))
+    # Half of them mirror a place on what glows, and a bit beside it.
+    to = corners.mean(1)[rng.integers(len(corners), size=20)] - points + rng.normal(0.0, 0.05, (20, 3))
+    normals, views = rng.normal(size=(2, 20, 3))
+    for some in (normals, views, to):
+        some /= np.linalg.norm(some, axis=1, keepdims=True)
+    normals *= np.sign((to * normals).sum(1, keepdims=True))
+    views[::2] = (2.0 * (to * normals).sum(1, keepdims=True) * normals - to)[::2]
+    views *= np.sign((views * normals).sum(1, keepdims=True))
+    table, found, none = table_of(what), np.zeros((20, 3)), np.zeros((20, 3))
+    _ask_gleam(Pointer(table), points, normals, views, np.full(20, alpha), False, found)
+    _ask_gleam(Pointer(table), points, normals, views, np.full(20, alpha), True, none)
+    assert not none.any()
+    fine = max(12, int(math.sqrt(2e5 / len(corners))))
+    expected = np.array(
+        [arrives(corners, radiance, p, lambda d: lobe(d, n, wo, alpha), fine)  # noqa: B023
+         for p, n, wo in zip(points, normals, views, strict=True)]
+    )  # fmt: skip
+    steep = (views * normals).sum(1) > 0.1
+    found, expected = found[steep], expected[steep]
+    assert np.abs(found - expected).mean() < 0.02 * expected.mean()
+    bright = expected.sum(1) > 0.05 * expected.sum(1).max()
+    np.testing.assert_allclose(found[bright], expected[bright], rtol=0.12)

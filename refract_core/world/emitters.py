@@ -233,8 +233,7 @@ def _light(kind: LightKind, radiance: F64, centre: F64, size: float) -> Light:
     place = np.eye(4)
     place[:3, 3] = centre
     r, g, b = (float(c) for c in radiance)
-    # Mirrors see the surface itself.
-    return Light("", kind, (r, g, b), place, (size, 0.0), specular=0.0)
+    return Light("", kind, (r, g, b), place, (size, 0.0))
 
 
 # --- objects as lights ----------------------------------------------------------------------------------------------

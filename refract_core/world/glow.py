@@ -16,7 +16,8 @@ import numpy as np
 
 from ..kernels.arrays import F64_1D, F64_2D, F64_3D, I32_1D
 from ..kernels.compile import inlined
-from ..kernels.vec import Vec, add, dot, length, row, scale, sub
+from ..kernels.vec import Vec, add, along, dot, length, normalize, row, scale, sub
+from ..optics.lobes import ggx, smith_visibility
 from ..scene import Light
 from .polygon import corner, polygon_irradiance
 
@@ -26,6 +27,13 @@ _FLAT = 0.985
 """Length of the mean of a node's normals from which on it is nearly flat."""
 _TILT = 0.3
 """Sine of the angle by which normals of a nearly flat node may differ from their mean, and a bit."""
+
+
+_PART_OF_LOBE, _PART_OF_WAY = 0.5, 0.35
+"""How wide the parts of a highlight are at most [rad], beside the lobe's alpha, and beside how far they are from its
+middle."""
+_MOST_LEVELS = 6
+"""At each of which a triangle is cut into four for that."""
 
 
 class GlowTree(NamedTuple):
@@ -111,6 +119,100 @@ def glow_irradiance(glow: GlowTree, root: int, p: Vec, n: Vec) -> float:
         else:
             i += 1
     return total
+
+
+@inlined
+def glow_highlight(glow: GlowTree, root: int, p: Vec, n: Vec, wo: Vec, alpha: float) -> float:
+    """Reflected radiance, without Fresnel and shadow, of a GGX surface of width alpha, per radiance that triangles of
+    weight 1 have: the lobe, summed over what is small in it. A node counts as a point where the lobe hardly changes
+    across it, so in the middle of the lobe it is small beside alpha, and far from there beside its way to the middle.
+    """
+    n_dot_v = dot(n, wo)
+    if n_dot_v <= 0.0:
+        return 0.0
+    r = sub(scale(n, 2.0 * n_dot_v), wo)
+    total = 0.0
+    i, end = root, glow.after[root]
+    while i < end:
+        power, radius = glow.power[i], glow.node[i, 3]
+        to = sub(row(glow.node, i), p)
+        if power <= 0.0 or dot(to, n) <= -radius:
+            i = glow.after[i]
+            continue
+        facing = row(glow.facing, i)
+        flat = length(facing)
+        toward = -dot(facing, to)
+        d2 = max(dot(to, to), 1e-12)
+        d = math.sqrt(d2)
+        if glow.right[i] == 0:
+            if toward > 0.0:
+                total += _gleam_of_triangle(glow, i, p, n, wo, r, alpha)
+            i = glow.after[i]
+            continue
+        if flat >= _FLAT * power:
+            if toward <= -flat * (radius + _TILT * d):  # turned away
+                i = glow.after[i]
+                continue
+            if d2 >= _FAR * _FAR * radius * radius and radius <= _smallness(scale(to, 1.0 / d), r, alpha) * d:
+                bent = math.sqrt(max(0.0, 1.5 * (1.0 - (flat / power) ** 2)))
+                solid = flat * _above(toward / (flat * d), bent) / d2
+                total += solid * _lobe(scale(to, 1.0 / d), n, wo, n_dot_v, alpha)
+                i = glow.after[i]
+                continue
+        i += 1
+    return total
+
+
+@inlined
+def _lobe(wi: Vec, n: Vec, wo: Vec, n_dot_v: float, alpha: float) -> float:
+    """Reflected radiance per radiance and solid angle of what lies in a direction [1 / sr], without Fresnel."""
+    n_dot_l = dot(n, wi)
+    if n_dot_l <= 0.0:
+        return 0.0
+    h = normalize(add(wi, wo))
+    return ggx(dot(n, h), alpha) * smith_visibility(n_dot_v, n_dot_l, alpha) * n_dot_l
+
+
+@inlined
+def _smallness(direction: Vec, r: Vec, alpha: float) -> float:
+    """How wide [rad] what lies in a direction may be to count as a point in a lobe about `r`."""
+    return max(_PART_OF_LOBE * alpha, _PART_OF_WAY * length(sub(direction, r)))
+
+
+@inlined
+def _gleam_of_triangle(glow: GlowTree, i: int, p: Vec, n: Vec, wo: Vec, r: Vec, alpha: float) -> float:
+    """`glow_highlight` of the triangle in a leaf: into four, and those again, until each part is small in the lobe."""
+    axes = glow.corner[glow.triangle[i]]
+    m, x, y = row(axes, 0), row(axes, 1), row(axes, 2)
+    first = corner(m, x, y, 0, 3)
+    ab, ac = sub(corner(m, x, y, 1, 3), first), sub(corner(m, x, y, 2, 3), first)
+    facing, n_dot_v = row(glow.facing, i), dot(n, wo)
+    total = 0.0
+    level, digits = 0, 0  # which of the four, two bits for each level
+    while level >= 0:
+        a, size = sub(first, p), 1.0
+        for k in range(level):
+            which = (digits >> 2 * (level - 1 - k)) & 3
+            half = 0.5 * size
+            if which == 1 or which == 3:
+                a = along(a, ab, half)
+            if which == 2 or which == 3:
+                a = along(a, ac, half)
+            size = -half if which == 3 else half
+        to = along(along(a, ab, size / 3.0), ac, size / 3.0)
+        radius, area = abs(size) * glow.node[i, 3], size * size * glow.area[i]
+        # What lies on the receiver is no nearer than its own size: it fills no more than the hemisphere.
+        d2 = max(dot(to, to), area / (2.0 * math.pi), 1e-12)
+        d = math.sqrt(d2)
+        wi = scale(to, 1.0 / d)
+        if radius > _smallness(wi, r, alpha) * d and level < _MOST_LEVELS:
+            level, digits = level + 1, digits << 2
+            continue
+        total += size * size * -dot(facing, wi) / d2 * _lobe(wi, n, wo, n_dot_v, alpha)
+        while level > 0 and digits & 3 == 3:
+            level, digits = level - 1, digits >> 2
+        level, digits = (level, digits + 1) if level > 0 else (-1, 0)
+    return max(0.0, total)
 
 
 @inlined

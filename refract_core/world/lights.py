@@ -20,9 +20,9 @@ from ..kernels.arrays import F32_1D, F64_1D, F64_2D, F64_3D, I32_1D, I64_2D, U8_
 from ..kernels.choice import choice
 from ..kernels.compile import inlined, leaf
 from ..kernels.vec import Vec, add, cross, dot, frame, length, lerp, normalize, row, scale, sub
-from ..optics.lobes import ggx, sample_cosine, smith_visibility
+from ..optics.lobes import ggx, sample_cosine, smith_visibility, specular_albedo
 from ..scene import LightKind
-from .glow import GlowTree, glow_irradiance, glow_target
+from .glow import GlowTree, glow_highlight, glow_irradiance, glow_target
 from .polygon import polygon_edge, polygon_irradiance
 
 _DISK_SIDES = 12
@@ -169,8 +169,18 @@ def irradiance_factor(lights: LightTable, which: int, p: Vec, n: Vec) -> float:
 
 
 @inlined
-def highlight(lights: LightTable, which: int, p: Vec, n: Vec, wo: Vec, alpha: float) -> float:
-    """Reflected radiance per radiance of a light, without Fresnel and shadow, for a GGX surface of width alpha.
+def any_glows(lights: LightTable) -> bool:
+    """Surfaces that glow are among the lights."""
+    for l in range(lights.kind.shape[0]):  # noqa: E741
+        if lights.kind[l] == LightKind.GLOW.value or lights.kind[l] == LightKind.BALL.value:
+            return True
+    return False
+
+
+@inlined
+def highlight(lights: LightTable, which: int, p: Vec, n: Vec, wo: Vec, alpha: float, mirrors: bool) -> float:
+    """Reflected radiance per radiance of a light, without Fresnel and shadow, for a GGX surface of width alpha. What
+    glows has none on a surface that `mirrors` it: there it is seen itself.
 
     A mirror shows the light's own shape: 1 where the mirrored ray hits it, else 0. A rough surface sees it as one
     direction, that of the light's point nearest to the mirrored ray, with a lobe widened by half the light's angular
@@ -180,7 +190,17 @@ def highlight(lights: LightTable, which: int, p: Vec, n: Vec, wo: Vec, alpha: fl
     if n_dot_v <= 0.0:
         return 0.0
     r = sub(scale(n, 2.0 * n_dot_v), wo)
-    point, inside, solid, radius = nearest_to(lights.kind[which], lamp_of(lights, which), p, r)
+    kind = lights.kind[which]
+    if kind == LightKind.GLOW.value or kind == LightKind.BALL.value:
+        if mirrors:
+            return 0.0
+        if kind == LightKind.GLOW.value:
+            return glow_highlight(lights.glow, lights.root[which], p, n, wo, alpha)
+        c = sub(row(lights.axes[which], 3), p)
+        if dot(c, c) <= lights.size[which, 0] * lights.size[which, 0]:  # inside it everything shines
+            return specular_albedo((1.0, 1.0, 1.0), math.sqrt(alpha), n_dot_v)[0]
+        kind = LightKind.SPHERE.value
+    point, inside, solid, radius = nearest_to(kind, lamp_of(lights, which), p, r)
     if solid <= 0.0:
         return 0.0
     # Sharp surfaces show the light's own shape, rough ones its blur; in between both, so that there is no step.

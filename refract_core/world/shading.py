@@ -23,7 +23,7 @@ from .bounced import bounced_light
 from .caustics import caustic_irradiance
 from .embree import SCATTERED, Packet, clear, has_hit, ray_direction, set_ray
 from .environment import TEXEL_LUMINANCE, EnvironmentTable, direction_pdf, irradiance, prefiltered, sample_direction
-from .lights import LightTable, highlight, irradiance_factor, shadow_ray
+from .lights import LightTable, any_glows, highlight, irradiance_factor, shadow_ray
 from .offsets import off_surface
 from .shaping import shape_matt, shape_mirrored
 from .surface import Interaction, color_input, float_input, hit_in, interaction, normal_input, share_input, thing_of
@@ -315,7 +315,8 @@ def aim_light(block: Block, lane: int, lights: LightTable, l: int) -> bool:  # n
         block.lamp_diffuse[lane] = irradiance_factor(lights, l, p, n) * lights.diffuse[l]
     gloss = block.roughness[lane]
     if lights.specular[l] > 0.0:
-        block.lamp_specular[lane] = highlight(lights, l, p, n, wo, gloss * gloss) * lights.specular[l]
+        rays = _sees_what_glows(block, lane)
+        block.lamp_specular[lane] = highlight(lights, l, p, n, wo, gloss * gloss, rays) * lights.specular[l]
     if lights.even[l] == 0:
         _shape(block, lane, lights, l)
     # A clear coat has a highlight of its own, where the rest of the surface may have none.
@@ -384,7 +385,8 @@ def add_light(block: Block, lane: int, lights: LightTable, l: int) -> None:  # n
     if coat > 0.0 and lights.specular[l] > 0.0:
         gloss = block.coat_roughness[lane]
         fc = coat * (_COAT_F0 + (1.0 - _COAT_F0) * (1.0 - min(1.0, max(0.0, dot(n, wo)))) ** 5)
-        coat_light = fc * highlight(lights, l, p, n, wo, gloss * gloss) * lights.specular[l]
+        sharp = gloss < _POLISHED_ROUGHNESS
+        coat_light = fc * highlight(lights, l, p, n, wo, gloss * gloss, sharp) * lights.specular[l]
         if lights.even[l] == 0 and coat_light > 0.0:
             over = mul(over, shape_mirrored(lights, l, p, n, wo, gloss * gloss))
     if lights.even[l] == 0:
@@ -610,6 +612,13 @@ def _reflects_the_scene(f0: Vec, roughness: float) -> bool:
 
 
 @inlined
+def _sees_what_glows(block: Block, lane: int) -> bool:
+    """By its mirror rays, if it sends any: what glows has no highlight on it. Rougher surfaces would meet small things
+    that glow with few of their rays, each of them a speck; they have the highlight alone."""
+    return block.spreads[lane] == 0 or block.roughness[lane] < _POLISHED_ROUGHNESS
+
+
+@inlined
 def shade(block: Block, second: Block, packet: Packet, world: World, mask: int) -> None:
     """Radiance of every hit in `block` into `block.color`. `second` is another block, for what the mirrors show.
 
@@ -660,6 +669,8 @@ def _add_mirrored(block: Block, second: Block, packet: Packet, world: World, mas
         if k >= block.bounced[lane]:
             continue
         if second.on[lane] != 0:
+            if not _sees_what_glows(block, lane) and any_glows(world.lights):
+                put(second.color, lane, sub(row(second.color, lane), row(second.emissive, lane)))
             _add_gloss_of_sky(second, lane, world, row(second.f0, lane), second.roughness[lane], 1.0)
             light = row(second.color, lane)
         elif world.environment.present:
