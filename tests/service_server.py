@@ -23,7 +23,10 @@ ROOT = Path(__file__).parents[1]
 SMALL: dict[str, Any] = {"image_width": 32, "samples": 1}
 LONG: dict[str, Any] = {"stage": "marble.usda", "image_width": 1920, "samples": 64}
 """Minutes of work: still under way whatever a test did meanwhile. For servers with `PATIENT`."""
-PATIENT = ("--limit", "job_seconds=3600", "--limit", "cpu_seconds=3600", "--limit", "pixel_samples=200000000")
+PATIENT = (
+    "--limit", "job_seconds=3600", "--limit", "stage_seconds=3600", "--limit", "cpu_seconds=3600",
+    "--limit", "pixel_samples=200000000",
+)  # fmt: skip
 """Words for a server whose limits of time are not what is tested: jobs take long where others want the cores too."""
 PATIENCE = 180.0
 """[s] Longest wait for what has to happen. Who waits for a condition loses nothing by it; only a failure comes late."""
