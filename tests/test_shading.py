@@ -139,6 +139,22 @@ def half_clear(**fields: Any) -> Material:
     return material("/leaf", OPACITY=opacity, EMISSIVE=3.0, **fields)
 
 
+@pytest.mark.parametrize("roughness", [0.3, 0.45])
+def test_a_rough_mirror_is_quiet_and_right(roughness: float) -> None:
+    """Beside the same picture of 256 samples a pixel: pixels share what their rays see, and lose none of it. With rays
+    for themselves alone they were three times as far from it."""
+    metal = material("/metal", DIFFUSE=1.0, METALLIC=1.0, ROUGHNESS=roughness)
+    floor = quad("/floor", [(-5, 0, 5), (5, 0, 5), (5, 0, -5), (-5, 0, -5)], 0)
+    wall = quad("/wall", [(-1, 0, -1.5), (0.2, 0, -1.5), (0.2, 3, -1.5), (-1, 3, -1.5)], 1)
+    lens = camera((0, 1.0, 2.0), (-0.3, 0, -0.4), 0.12)
+    sun = light(LightKind.DISTANT, (0, 0, 0), (0, 0, -1), (0, 0))
+    what = scene([floor, wall], [metal, material("/matt", DIFFUSE=0.9, IOR=1.0)], lights=(sun,), cameras=(lens,))
+    quick = draw(what, samples=16, tolerance=0.03, tiers=("screen", "ray", "sky"))["beauty"][..., 0].astype(np.float64)
+    right = draw(what, samples=256, tolerance=0.0)["beauty"][..., 0].astype(np.float64)
+    assert quick.mean() == pytest.approx(right.mean(), rel=0.003)
+    assert np.sqrt(np.square(quick - right).mean()) < 0.03 * right.mean()
+
+
 def test_a_cut_out_lets_view_rays_through_its_holes() -> None:
     wall = quad("/wall", np.array(CARD) * 4 - [0, 0, 1], 1)
     leaf = half_clear(opacity_threshold=0.5)

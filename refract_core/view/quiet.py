@@ -21,7 +21,7 @@ from ..kernels.arrays import F64_1D, F64_2D, I32_1D, I32_2D
 from ..kernels.compile import inlined, kernel, word
 from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Vectors, new_lanes, put
 from ..kernels.sampling import Key, set_key
-from ..kernels.vec import Vec, add, along, dot, length, lerp, mul, row, sub
+from ..kernels.vec import Vec, add, along, dot, length, lerp, mul, row, scale, sub
 from ..world.embree import COHERENT, EVERYTHING, OPAQUE, clear, has_hit
 from ..world.shading import (
     LOBES,
@@ -35,6 +35,7 @@ from ..world.shading import (
     copy_lane,
     forget_light,
     load_hits,
+    look_into_mirrors,
     nth,
     send_back,
     share_of_lamp,
@@ -60,6 +61,9 @@ _STEP_OF_LAMP = 0.05
 """Share of a lamp's light by which neighbours differ that do not see the same of it. Shadows of glass are no steps."""
 _FLAT = 0.1
 """Part of their distance by which places may lie outside of each other's plane."""
+_SHARP, _PIXELS = 0.02, 8.0
+"""GGX width from which on neighbours share what they see in mirrors [alpha]; and the angles between two pixels that it
+is, at least."""
 _FIRST = word(0)
 """The sample that corners are."""
 _NET = 1 << 16
@@ -414,21 +418,75 @@ def _send(
     scratch: QuietScratch, world: World, view: View, care: Care, layer: OpaqueLayer, x0: int, y0: int, x1: int, y1: int
 ) -> None:
     """Let every place send back what arrives, and write the picture."""
-    looking = scratch.looking
-    block, packet = looking.block, looking.packet
+    looking, places = scratch.looking, scratch.places
+    block = looking.block
+    _look_into_mirrors(scratch, world, care, x0, y0, x1, y1)
     for by in range(y0, y1, BLOCK_HEIGHT):
         for bx in range(x0, x1, BLOCK_WIDTH):
             for lane in range(LANES):
                 x, y = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
                 block.on[lane] = 0
                 block.distance[lane] = math.inf
-                set_key(block.key, lane, Key(x, y, 0, 0))
-                if x < x1 and y < y1 and scratch.part[_place(x - x0, y - y0)] >= 0:
-                    copy_lane(block, lane, scratch.places, _place(x - x0, y - y0))
-                    block.lobes[lane] = max(1, care.rays // LOBES)
-            send_back(block, looking.second, packet, world, OPAQUE)
+                i = _place(x - x0, y - y0)
+                if x < x1 and y < y1 and scratch.part[i] >= 0:
+                    copy_lane(block, lane, places, i)
+                    block.bounced[lane] = places.bounced[i]
+                    if block.bounced[lane] > 0:
+                        put(block.mirrored, lane, _mirrored(places, scratch.part, view.spread, i))
+            send_back(block, world)
             write_opaque(layer, block, world, view, bx, by)
             _keep_shares(scratch, layer, bx, by, x0, y0, x1, y1)
+
+
+@inlined
+def _look_into_mirrors(scratch: QuietScratch, world: World, care: Care, x0: int, y0: int, x1: int, y1: int) -> None:
+    """Send the mirror rays of every place, those of the margin too."""
+    places, looking = scratch.places, scratch.looking
+    block = looking.block
+    for by in range(y0 - BLOCK_HEIGHT, y1 + _MARGIN, BLOCK_HEIGHT):
+        for bx in range(x0 - BLOCK_WIDTH, x1 + _MARGIN, BLOCK_WIDTH):
+            for lane in range(LANES):
+                x, y = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
+                block.on[lane] = 0
+                if not (x0 - _MARGIN <= x < x1 + _MARGIN and y0 - _MARGIN <= y < y1 + _MARGIN):
+                    continue
+                i = _place(x - x0, y - y0)
+                if scratch.part[i] < 0:
+                    continue
+                copy_lane(block, lane, places, i)
+                block.lobes[lane] = max(1, care.rays // LOBES)
+                set_key(block.key, lane, _net_key(x, y))
+            look_into_mirrors(block, looking.second, looking.packet, world, OPAQUE)
+            for lane in range(LANES):
+                x, y = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
+                if block.on[lane] != 0:
+                    places.bounced[_place(x - x0, y - y0)] = block.bounced[lane]
+                    put(places.mirrored, _place(x - x0, y - y0), row(block.mirrored, lane))
+
+
+@inlined
+def _mirrored(places: Block, part: I32_1D, spread: float, i: int) -> Vec:
+    """What a rough mirror shows: the mean over the places around that send their rays into nearly the same lobe. With
+    half of what is two away, every place of a net counts as much as every other, so their rays are one sequence."""
+    alpha = places.roughness[i] * places.roughness[i]
+    own = row(places.mirrored, i)
+    if alpha <= max(_SHARP, _PIXELS * spread):
+        return own
+    total, weights = own, 1.0
+    for down in range(-_MARGIN, _MARGIN + 1):
+        for right in range(-_MARGIN, _MARGIN + 1):
+            j = i + down * _SPAN + right
+            if j == i or part[j] != part[i] or places.bounced[j] == 0:
+                continue
+            if abs(places.roughness[j] - places.roughness[i]) > 0.1 * places.roughness[i]:
+                continue
+            # A normal that is turned by an angle sends the lobe's middle twice as far.
+            turned = 8.0 * (1.0 - dot(row(places.ns, i), row(places.ns, j)))
+            weight = max(0.0, 1.0 - turned / (alpha * alpha))
+            weight *= 0.5 if abs(down) == _MARGIN else 1.0
+            weight *= 0.5 if abs(right) == _MARGIN else 1.0
+            total, weights = along(total, row(places.mirrored, j), weight), weights + weight
+    return scale(total, 1.0 / weights)
 
 
 @inlined

@@ -126,6 +126,8 @@ class Block(NamedTuple):
     # Within `shade`, for the mirror bounce.
     bounced: Words
     """mirror rays that are sent"""
+    mirrored: Vectors
+    """mean radiance that they bring"""
     bounce: Vectors
     """its unit direction, needed after the packet has been used again"""
     bounce_end: Scalars
@@ -625,30 +627,42 @@ def shade(block: Block, second: Block, packet: Packet, world: World, mask: int) 
     `mask`: what reflections and shadows may meet. The packet is overwritten.
     """
     gather(block, packet, world, mask)
-    send_back(block, second, packet, world, mask)
+    look_into_mirrors(block, second, packet, world, mask)
+    send_back(block, world)
 
 
 @inlined
-def send_back(block: Block, second: Block, packet: Packet, world: World, mask: int) -> None:
-    """The rest of `shade`, once the light has been gathered."""
-    _add_matt(block)
+def look_into_mirrors(block: Block, second: Block, packet: Packet, world: World, mask: int) -> None:
+    """Send the mirror rays of every hit in the block, into `block.mirrored`. The packet is overwritten."""
     most = 0
     for lane in range(LANES):
         block.bounced[lane] = 0
         block.bounce_end[lane] = math.inf
-        if block.on[lane] == 0:
-            continue
-        f0, roughness = row(block.f0, lane), block.roughness[lane]
-        if _reflects_the_scene(f0, roughness):
-            if roughness**2 <= MIRROR_ALPHA:
+        put(block.mirrored, lane, (0.0, 0.0, 0.0))
+        if block.on[lane] != 0 and _reflects_the_scene(row(block.f0, lane), block.roughness[lane]):
+            if block.roughness[lane] ** 2 <= MIRROR_ALPHA:
                 block.lobes[lane] = 1
             block.bounced[lane] = block.lobes[lane]
             most = max(most, block.lobes[lane])
+    for k in range(most):
+        _add_mirrored(block, second, packet, world, mask, k)
+
+
+@inlined
+def send_back(block: Block, world: World) -> None:
+    """The rest of `shade`, once the light has been gathered and the mirror rays are back."""
+    _add_matt(block)
+    for lane in range(LANES):
+        if block.on[lane] == 0:
+            continue
+        f0, roughness = row(block.f0, lane), block.roughness[lane]
+        if block.bounced[lane] > 0:
+            cosine = min(1.0, max(1e-3, dot(row(block.ns, lane), row(block.wo, lane))))
+            light = mul(row(block.mirrored, lane), specular_albedo(f0, roughness, cosine))
+            put(block.color, lane, add(row(block.color, lane), light))
         else:
             _add_gloss_of_sky(block, lane, world, f0, roughness, 1.0)
         _add_coat_of_sky(block, lane, world)
-    for k in range(most):
-        _add_mirrored(block, second, packet, world, mask, k)
 
 
 @inlined
@@ -680,10 +694,7 @@ def _add_mirrored(block: Block, second: Block, packet: Packet, world: World, mas
             light = prefiltered(world.environment, row(block.bounce, lane), wide)
         else:
             continue
-        cosine = min(1.0, max(1e-3, dot(row(block.ns, lane), row(block.wo, lane))))
-        reflectance = specular_albedo(row(block.f0, lane), block.roughness[lane], cosine)
-        light = scale(mul(light, reflectance), 1.0 / block.bounced[lane])
-        put(block.color, lane, add(row(block.color, lane), light))
+        put(block.mirrored, lane, along(row(block.mirrored, lane), light, 1.0 / block.bounced[lane]))
 
 
 @inlined
