@@ -31,6 +31,10 @@ DEPTH = 64
 """Interfaces that a path may meet."""
 _FAR = 1e4
 """Of a sun [m]"""
+_THROWN = 1 << 21
+"""Rays that each lamp throws at glass, for every call"""
+_SQUARES = 400
+"""Of a metre, that keep what is thrown"""
 
 
 class Light(StrEnum):
@@ -45,6 +49,8 @@ class Light(StrEnum):
     """The same, and matt surfaces light each other: Mitsuba's own `path`, as anybody would use it."""
     ONCE = "once"
     """As WORLD, but lamps are what they are to refract: they hide nothing, and are seen in mirror pictures alone."""
+    THROWN = "thrown"
+    """The same with little noise, in rooms with `others`: lamps throw their light through glass onto what is flat."""
 
 
 class Loaded(NamedTuple):
@@ -105,7 +111,9 @@ def load(mi: Any, room: Room, width: int) -> Loaded:
     without = tuple(solid for solid in room.solids if not solid.finish.glass)
     integrators = {Light.PATH: path(mi), Light.ONCE: _by_lamps(mi, room, room.solids)}
     if room.others:
-        integrators[Light.STRAIGHT] = _by_lamps(mi, room, without)
+        integrators |= {
+            Light.STRAIGHT: _by_lamps(mi, room, without), Light.THROWN: _by_lamps(mi, room, room.solids, thrown=_THROWN)
+        }  # fmt: skip
     else:
         opaque = mi.load_dict(_scene(mi, room, without, width))
         integrators |= {Light.STRAIGHT: _once_lit(mi, opaque), Light.WORLD: _once_lit(mi, None)}
@@ -341,31 +349,34 @@ def _once_lit(mi: Any, opaque: Any | None) -> Any:
     return OnceLit(mi.Properties())
 
 
-def _by_lamps(mi: Any, room: Room, solids: tuple[Solid, ...]) -> Any:
+def _by_lamps(mi: Any, room: Room, solids: tuple[Solid, ...], thrown: int = 0) -> Any:
     """An integrator for `Light.ONCE`: camera, glass, one matt surface, glass, lamp. Of the opaque solids alone it is
     `Light.STRAIGHT`.
 
-    Each lamp is a scene of its own, so that it hides nothing. A matt surface asks a point of each straight on, and sends
-    one ray to glass, evenly over the cones of the balls around its bodies.
+    A matt surface asks a point of each lamp straight on, and sends one ray to glass, evenly over the cones of the balls
+    around its bodies. Lamps are no part of the scene that rays meet, so they hide nothing.
 
     Args:
         solids: what light meets on its way; eyes look at all of the room.
+        thrown: rays that each lamp throws at glass beforehand, in place of those that flat surfaces send (`Light.THROWN`).
     """
     dr = importlib.import_module("drjit")
     context = mi.BSDFContext()
     parts = {solid.name: _mesh(mi, solid, room) for solid in room.solids}
     things = mi.load_dict({"type": "scene", **parts})
     stops = mi.load_dict({"type": "scene", **{solid.name: parts[solid.name] for solid in solids}})
+    lights = [light for light in (room.lamp, *room.others) if light is not None]
     lamps = [mi.load_dict({"type": "scene", "lamp": lamp}) for lamp in _lamps(mi, room).values()]
+    shining = [_meets(mi, light) for light in lights]
     tints = [(mi.ShapePtr(parts[s.name]), np.log(s.finish.tint)) for s in room.solids if min(s.finish.tint) < 1.0]
     balls = [_ball_around(solid) for solid in solids if solid.finish.glass]
-    shining = [_meets(mi, light) for light in (room.lamp, *room.others) if light is not None]
+    flat = [(mi.ShapePtr(parts[s.name]), s.st.max(0).astype(int)) for s in room.solids if s.st is not None and thrown]
 
     def is_glass(si: Any, active: Any) -> Any:
         return active & si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)
 
     def let_through(si: Any, glass: Any) -> Any:
-        """By the glass that a ray has gone through to its surface, by Beer and Lambert; hits know metres."""
+        """By the glass that a ray has gone through to its surface, by Beer and Lambert."""
         found, inside = mi.Spectrum(1.0), glass & (mi.Frame3f.cos_theta(si.wi) < 0.0)
         for shape, logarithm in tints:
             left = dr.exp(mi.Spectrum(*(100.0 * logarithm).tolist()) * si.t)
@@ -401,15 +412,69 @@ def _by_lamps(mi: Any, room: Room, solids: tuple[Solid, ...]) -> Any:
         si, weight, light, *_ = dr.while_loop(state, lambda *s: s[5], step)
         return si, weight, light
 
+    def to_balls(sampler: Any, p: Any, active: Any) -> tuple[Any, Any]:
+        """A direction evenly over the cones of all balls of glass, and the solid angle that it stands for."""
+        cones, whole = [], mi.Float(0.0)
+        for centre, radius in balls:
+            axis = mi.Point3f(*centre) - p
+            square = dr.squared_norm(axis)
+            cosine = dr.select(square > radius**2, dr.sqrt(dr.maximum(0.0, 1.0 - radius**2 / square)), -1.0)
+            cones.append((dr.normalize(axis), cosine))
+            whole += 1.0 - cosine
+        chosen, at = sampler.next_1d(active) * whole, sampler.next_2d(active)
+        direction, begin, number = mi.Vector3f(0.0, 1.0, 0.0), mi.Float(0.0), mi.Float(0.0)
+        for axis, cosine in cones:
+            within = mi.Frame3f(axis).to_world(mi.warp.square_to_uniform_cone(at, cosine))
+            direction = dr.select(chosen >= begin, within, direction)
+            begin += 1.0 - cosine
+        for axis, cosine in cones:
+            number += dr.select(dr.dot(axis, direction) >= cosine, 1.0, 0.0)
+        return direction, dr.two_pi * whole / dr.maximum(number, 1.0)
+
+    def square_of(si: Any, metres: Any) -> Any:
+        """Number of the square of a flat surface that a place lies in."""
+        wide, high = (_SQUARES * int(one) for one in metres)
+        i, j = (mi.UInt32(dr.clip(si.uv[k] * _SQUARES, 0, most - 1)) for k, most in enumerate((wide, high)))
+        return i + wide * j
+
     class ByLamps(mi.SamplingIntegrator):  # type: ignore[misc]
+        def render(self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, *rest: Any, **more: Any) -> Any:
+            if thrown:
+                self.kept = self.throw(int(dr.slice(seed)) if not isinstance(seed, int) else seed)
+            return super().render(scene, sensor, seed, spp, *rest, **more)
+
+        def throw(self, seed: int) -> list[Any]:
+            """Irradiance by way of glass, for each flat surface."""
+            kept = [dr.zeros(mi.Float, 3 * _SQUARES**2 * int(np.prod(metres))) for _, metres in flat]
+            for k, light in enumerate(lights):
+                sampler = mi.load_dict({"type": "independent"})
+                sampler.seed(len(lights) * seed + k, thrown)
+                ray, flux = _leaves(mi, light, balls, sampler, to_balls)
+                first = things.ray_intersect(ray, mi.Bool(True))
+                meets = is_glass(first, mi.Bool(True))
+                si, weight, _ = follow(sampler, first, True, meets)
+                weight *= flux * _SQUARES**2 / thrown
+                for sums, (shape, metres) in zip(kept, flat, strict=True):
+                    lands = meets & si.is_valid() & (si.shape == shape) & (mi.Frame3f.cos_theta(si.wi) > 0.0)
+                    for c in range(3):
+                        dr.scatter_add(sums, weight[c], 3 * square_of(si, metres) + c, lands)
+                dr.eval(*kept)
+            return kept
+
         def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> Any:
             active = mi.Bool(active)
             si = things.ray_intersect(ray, active)
             si, weight, light = follow(sampler, si, False, is_glass(si, active))
             surface = active & si.is_valid() & ~is_glass(si, active)
             lit = self.straight_on(sampler, si, surface)
+            waiting = mi.Bool(surface)
+            for k, (shape, metres) in enumerate(flat):
+                here = waiting & (si.shape == shape)
+                found = [dr.gather(mi.Float, self.kept[k], 3 * square_of(si, metres) + c, here) for c in range(3)]
+                lit += si.bsdf().eval(context, si, mi.Vector3f(0.0, 0.0, 1.0), here) * mi.Spectrum(*found)
+                waiting &= ~here
             if balls:
-                lit += self.through_glass(sampler, si, surface)
+                lit += self.through_glass(sampler, si, waiting)
             return light + dr.select(surface, weight * lit, 0.0), active, []
 
         def straight_on(self, sampler: Any, si: Any, active: Any) -> Any:
@@ -423,28 +488,12 @@ def _by_lamps(mi: Any, room: Room, solids: tuple[Solid, ...]) -> Any:
 
         def through_glass(self, sampler: Any, si: Any, active: Any) -> Any:
             """One direction out of all that may meet glass."""
-            cones, solid_angle = [], mi.Float(0.0)
-            for centre, radius in balls:
-                axis = mi.Point3f(*centre) - si.p
-                cosine = dr.select(
-                    dr.norm(axis) > radius, dr.sqrt(dr.maximum(0.0, 1.0 - radius**2 / dr.squared_norm(axis))), -1.0
-                )
-                cones.append((dr.normalize(axis), cosine))
-                solid_angle += 1.0 - cosine
-            chosen, at = sampler.next_1d(active) * solid_angle, sampler.next_2d(active)
-            direction, begin = mi.Vector3f(0.0), mi.Float(0.0)
-            for axis, cosine in cones:
-                within = mi.Frame3f(axis).to_world(mi.warp.square_to_uniform_cone(at, cosine))
-                direction = dr.select(chosen >= begin, within, direction)
-                begin += 1.0 - cosine
-            number = mi.Float(0.0)
-            for axis, cosine in cones:
-                number += dr.select(dr.dot(axis, direction) >= cosine, 1.0, 0.0)
+            direction, solid_angle = to_balls(sampler, si.p, active)
             first = things.ray_intersect(si.spawn_ray(direction), active)
             meets = is_glass(first, active)
             _, _, light = follow(sampler, first, True, meets)
             value = si.bsdf().eval(context, si, si.to_local(direction), meets)
-            return dr.select(meets, value * light * (dr.two_pi * solid_angle / dr.maximum(number, 1.0)), 0.0)
+            return dr.select(meets, value * light * solid_angle, 0.0)
 
     return ByLamps(mi.Properties())
 
@@ -480,3 +529,34 @@ def _meets(mi: Any, light: Lamp | Globe | Sun) -> tuple[Any, Colour]:
         return (dr.dot(ray.d, towards) > np.cos(np.radians(light.angle / 2.0))) & dr.isinf(before)
 
     return {Lamp: rectangle, Globe: globe, Sun: sun}[type(light)], light.radiance
+
+
+def _leaves(mi: Any, light: Lamp | Globe | Sun, balls: Any, sampler: Any, to_balls: Any) -> tuple[Any, Any]:
+    """A ray from a light to glass, and the flux that it stands for."""
+    dr = importlib.import_module("drjit")
+    at = sampler.next_2d()
+    if isinstance(light, Sun):
+        half = float(np.cos(np.radians(light.angle / 2.0)))
+        frame = mi.Frame3f(dr.normalize(mi.Vector3f(*light.towards)))
+        d = -frame.to_world(mi.warp.square_to_uniform_cone(at, half))
+        whole = sum(radius**2 for _, radius in balls)
+        chosen, place = sampler.next_1d() * whole, mi.warp.square_to_uniform_disk(sampler.next_2d())
+        origin, begin, number = mi.Point3f(0.0), 0.0, mi.Float(0.0)
+        for centre, radius in balls:
+            middle = mi.Point3f(*centre) - 10.0 * d
+            across = mi.Frame3f(d).to_world(mi.Vector3f(radius * place.x, radius * place.y, 0.0))
+            origin = dr.select(chosen >= begin, middle + across, origin)
+            begin += radius**2
+        for centre, radius in balls:
+            number += dr.select(dr.squared_norm(dr.cross(mi.Point3f(*centre) - origin, d)) < radius**2, 1.0, 0.0)
+        flux = dr.two_pi * (1.0 - half) * dr.pi * whole / dr.maximum(number, 1.0)
+        return mi.Ray3f(origin, d), mi.Spectrum(*light.radiance) * flux
+    if isinstance(light, Globe):
+        n = mi.warp.square_to_uniform_sphere(at)
+        p, area = mi.Point3f(*light.centre) + light.radius * n, 4.0 * dr.pi * light.radius**2
+    else:
+        x, y, z, middle = (mi.Vector3f(*light.world_from_lamp[:3, k].tolist()) for k in range(4))
+        p = mi.Point3f(middle + (at.x - 0.5) * light.size[0] * x + (at.y - 0.5) * light.size[1] * y)
+        n, area = -z, light.size[0] * light.size[1]
+    d, solid_angle = to_balls(sampler, p, mi.Bool(True))
+    return mi.Ray3f(p, d), mi.Spectrum(*light.radiance) * (dr.maximum(0.0, dr.dot(d, n)) * area * solid_angle)

@@ -361,7 +361,7 @@ def table_room() -> Room:
     amber = Finish(glass=True, tint=(0.96, 0.88, 0.70))
     things = (
         _quad("floor", Finish(albedo="wood"), [[-4, 0, 3], [4, 0, 3], [4, 0, -2], [-4, 0, -2]], (8.0, 5.0)),
-        _quad("wall", Finish(albedo=(0.5, 0.62, 0.7)), [[-4, 0, -2], [4, 0, -2], [4, 3, -2], [-4, 3, -2]]),
+        _quad("wall", Finish(albedo=(0.5, 0.62, 0.7)), [[-4, 0, -2], [4, 0, -2], [4, 3, -2], [-4, 3, -2]], (8.0, 3.0)),
         _ball("matt", Finish(albedo=(0.7, 0.3, 0.2)), place((0.45, 0.28, -1.05)), 0.28, 48),
         _ball("ball", GLASS, place((-1.0, 0.405, -0.1)), 0.4),
         _block("cube", place((-0.15, 0.255, 0.5), 30.0), (0.5, 0.5, 0.5)),
