@@ -217,11 +217,13 @@ def _arc(centre: tuple[float, float], radius: float, start: float, stop: float, 
 
 
 def _lens(name: str, at: F64, radius: float, bend: float, rim: float) -> Solid:
-    """Convex on both sides, round about y. `bend`: radius of its surfaces; `rim`: thickness at the edge [m]."""
+    """Convex on both sides, round about y. `bend`: radius of its surfaces; `rim`: thickness at the edge [m]. Its edge is
+    a smooth arc."""
     half = float(np.degrees(np.arcsin(radius / bend)))
     low = float(np.sqrt(bend**2 - radius**2)) - rim / 2.0
-    below = _arc((0.0, low), bend, -90.0, -90.0 + half, 49)
-    edge = _arc((radius, 0.0), rim / 2.0, -90.0, 90.0, 9)[1:-1]
+    below = _arc((0.0, low), bend, -90.0, half - 90.0, 49)
+    small = rim / 2.0 / float(np.cos(np.radians(half)))
+    edge = _arc((radius - small * float(np.sin(np.radians(half))), 0.0), small, half - 90.0, 90.0 - half, 9)[1:-1]
     above = _arc((0.0, -low), bend, 90.0 - half, 90.0, 49)
     profile = np.concatenate([below, edge, above])
     profile[[0, -1], 0] = 0.0
@@ -229,16 +231,15 @@ def _lens(name: str, at: F64, radius: float, bend: float, rim: float) -> Solid:
 
 
 def _bottle(name: str, finish: Finish, at: F64) -> Solid:
-    """Hollow, open on top, 0.92 m high; its walls are 2.5 cm thick, and its base is where y is 0."""
+    """Hollow, open on top, 93 cm high; its walls are 2.5 cm thick, and its base is where y is 0."""
+    belly, neck = (0.12, 0.50), (0.12 + 0.26 * 0.5, 0.50 + 0.26 * 0.75**0.5)  # the shoulder's two arcs, which touch
     outer = [
-        _arc((0.0, 0.0), 0.0, 0.0, 0.0, 1), _arc((0.19, 0.05), 0.05, -90.0, 0.0, 12),
-        _arc((0.12, 0.50), 0.12, 0.0, 60.0, 14), _arc((0.24, 0.70), 0.14, -120.0, -180.0, 14),
-        _arc((0.0875, 0.9075), 0.0125, 0.0, 90.0, 6),
+        np.zeros((1, 2)), _arc((0.19, 0.05), 0.05, -90.0, 0.0, 12), _arc(belly, 0.12, 0.0, 60.0, 14),
+        _arc(neck, 0.14, -120.0, -180.0, 14)[1:],
     ]  # fmt: skip
     inner = [
-        _arc((0.0875, 0.9075), 0.0125, 90.0, 180.0, 6)[1:], _arc((0.24, 0.70), 0.165, -180.0, -120.0, 14),
-        _arc((0.12, 0.50), 0.095, 60.0, 0.0, 14), _arc((0.165, 0.075), 0.05, 0.0, -90.0, 12),
-        _arc((0.0, 0.025), 0.0, 0.0, 0.0, 1),
+        _arc((0.0975, 0.92), 0.0125, 0.0, 180.0, 12), _arc(neck, 0.165, -180.0, -120.0, 14),
+        _arc(belly, 0.095, 60.0, 0.0, 14)[1:], _arc((0.165, 0.075), 0.05, 0.0, -90.0, 12), np.array([[0.0, 0.025]]),
     ]  # fmt: skip
     return _lathe(name, finish, at, np.concatenate([*outer, *inner]))
 
@@ -365,7 +366,7 @@ def table_room() -> Room:
         _ball("matt", Finish(albedo=(0.7, 0.3, 0.2)), place((0.45, 0.28, -1.05)), 0.28, 48),
         _ball("ball", GLASS, place((-1.0, 0.405, -0.1)), 0.4),
         _block("cube", place((-0.15, 0.255, 0.5), 30.0), (0.5, 0.5, 0.5)),
-        _lens("lens", place((0.62, 0.42, 0.35), 40.0, 25.0), 0.34, 0.62, 0.01),
+        _lens("lens", place((0.62, 0.42, 0.35), 40.0, 25.0), 0.34, 0.62, 0.02),
         _bottle("bottle", amber, place((1.35, 0.005, -0.35))),
         _board(lamp),
     )
