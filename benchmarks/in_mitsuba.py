@@ -44,7 +44,7 @@ class Light(StrEnum):
     """Nothing: glass casts no shadow and no caustic, and the lamp is seen only as the highlight on the outside of
     glass. It tells, beside the next, what caustics touch."""
     WORLD = "world"
-    """All it does: shadows, caustics, the lamp through glass. Only matt surfaces still do not light each other."""
+    """In rooms without `others`: all it does: shadows, caustics, the lamp through glass. Only matt surfaces still do not light each other."""
     PATH = "path"
     """The same, and matt surfaces light each other: Mitsuba's own `path`, as anybody would use it."""
     ONCE = "once"
@@ -109,14 +109,16 @@ def load(mi: Any, room: Room, width: int) -> Loaded:
     if room.lamp is None:
         return Loaded(mi, scene, dict.fromkeys(Light, _shining(mi)), silhouette)
     without = tuple(solid for solid in room.solids if not solid.finish.glass)
-    integrators = {Light.PATH: path(mi), Light.ONCE: _by_lamps(mi, room, room.solids)}
     if room.others:
-        integrators |= {
-            Light.STRAIGHT: _by_lamps(mi, room, without), Light.THROWN: _by_lamps(mi, room, room.solids, thrown=_THROWN)
+        integrators = {
+            Light.STRAIGHT: _by_lamps(mi, room, without), Light.ONCE: _by_lamps(mi, room, room.solids),
+            Light.THROWN: _by_lamps(mi, room, room.solids, thrown=_THROWN),
         }  # fmt: skip
     else:
         opaque = mi.load_dict(_scene(mi, room, without, width))
-        integrators |= {Light.STRAIGHT: _once_lit(mi, opaque), Light.WORLD: _once_lit(mi, None)}
+        integrators = {light: _once_lit(mi, light) for light in (Light.WORLD, Light.ONCE)}
+        integrators[Light.STRAIGHT] = _once_lit(mi, Light.STRAIGHT, opaque)
+    integrators[Light.PATH] = path(mi)
     return Loaded(mi, scene, integrators, silhouette)
 
 
@@ -258,7 +260,8 @@ def path(mi: Any) -> Any:
 def _follow(mi: Any, scene: Any, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any, Any, Any]:
     """Through glass, one branch at every interface, to what is not glass.
 
-    Returns what is met, the weight, whether glass was met, and whether the last of it was its outside, mirroring.
+    Returns what is met, the weight, whether glass was met, and whether lamps show: 2 if the last of it was its outside,
+    mirroring; 1 if it has mirrored on its inside since then; else 0.
     """
     dr = importlib.import_module("drjit")
 
@@ -266,24 +269,32 @@ def _follow(mi: Any, scene: Any, sampler: Any, ray: Any, active: Any) -> tuple[A
         found = live & hit.is_valid()
         return found & mi.has_flag(hit.shape.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)
 
-    def step(hit: Any, ray: Any, weight: Any, met: Any, outside: Any, depth: Any, live: Any, sampler: Any) -> Any:
+    def step(hit: Any, ray: Any, weight: Any, met: Any, shown: Any, depth: Any, live: Any, sampler: Any) -> Any:
         si = hit.compute_surface_interaction(ray, active=live)
         sample, factor = si.bsdf().sample(mi.BSDFContext(), si, sampler.next_1d(live), sampler.next_2d(live), live)
-        outside = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DeltaReflection) & (mi.Frame3f.cos_theta(si.wi) > 0.0)
+        shown = _shown_after(mi, sample, si, shown)
         ray = si.spawn_ray(si.to_world(sample.wo))
         hit = scene.ray_intersect_preliminary(ray, active=live)
         depth = depth + 1
         weight = dr.select(depth < DEPTH, weight * factor, 0.0)
         live = live & (depth < DEPTH) & goes_on(hit, live)
-        return hit, ray, weight, mi.Bool(True), outside, depth, live, sampler
+        return hit, ray, weight, mi.Bool(True), shown, depth, live, sampler
 
     hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
     state = (
-        hit, mi.Ray3f(ray), mi.Spectrum(1.0), mi.Bool(False), mi.Bool(False), mi.UInt32(0), goes_on(hit, active),
+        hit, mi.Ray3f(ray), mi.Spectrum(1.0), mi.Bool(False), mi.UInt32(0), mi.UInt32(0), goes_on(hit, active),
         sampler,
     )  # fmt: skip
-    hit, ray, weight, met, outside, *_ = dr.while_loop(state, lambda *s: s[6], step)
-    return hit.compute_surface_interaction(ray, active=active), weight, met, outside
+    hit, ray, weight, met, shown, *_ = dr.while_loop(state, lambda *s: s[6], step)
+    return hit.compute_surface_interaction(ray, active=active), weight, met, shown
+
+
+def _shown_after(mi: Any, sample: Any, si: Any, shown: Any) -> Any:
+    """How lamps show behind an interface, as `_follow` returns it."""
+    dr = importlib.import_module("drjit")
+    mirrored = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DeltaReflection)
+    inside = mi.Frame3f.cos_theta(si.wi) < 0.0
+    return dr.select(mirrored, dr.select(inside, mi.UInt32(1), 2), dr.select(shown == 1, mi.UInt32(1), 0))
 
 
 def _through_glass(mi: Any) -> Any:
@@ -297,12 +308,14 @@ def _through_glass(mi: Any) -> Any:
     return ThroughGlass(mi.Properties())
 
 
-def _once_lit(mi: Any, opaque: Any | None) -> Any:
+def _once_lit(mi: Any, light: Light, opaque: Any | None = None) -> Any:
     """An integrator that lights the first matt surface behind any glass.
 
     Args:
+        light: STRAIGHT, WORLD or ONCE.
         opaque: the scene without glass, in which light is looked for (`Light.STRAIGHT`); None: the scene itself.
     """
+    least = {Light.STRAIGHT: 2, Light.WORLD: 0, Light.ONCE: 1}[light]
     dr = importlib.import_module("drjit")
 
     def power(a: Any, b: Any) -> Any:
@@ -310,17 +323,15 @@ def _once_lit(mi: Any, opaque: Any | None) -> Any:
 
     class OnceLit(mi.SamplingIntegrator):  # type: ignore[misc]
         def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> Any:
-            si, weight, _, outside = _follow(mi, scene, sampler, ray, active)
-            light = self.seen(scene, si, outside, active)
+            si, weight, _, shown = _follow(mi, scene, sampler, ray, active)
+            light = self.seen(scene, si, shown, active)
             surface = active & si.is_valid()
             light += self.by_lamp(scene, sampler, si, surface) + self.by_chance(scene, sampler, si, surface)
             return weight * light, active & si.is_valid(), []
 
-        def seen(self, scene: Any, si: Any, outside: Any, active: Any) -> Any:
+        def seen(self, scene: Any, si: Any, shown: Any, active: Any) -> Any:
             """What shines by itself: the sky; the lamp where it counts."""
-            emitter = si.emitter(scene, active)
-            counts = active & (~si.is_valid() | outside) if opaque is not None else active
-            return emitter.eval(si, counts)
+            return si.emitter(scene, active).eval(si, active & (~si.is_valid() | (shown >= least)))
 
         def by_lamp(self, scene: Any, sampler: Any, si: Any, active: Any) -> Any:
             """A sample of the lamp or the sky."""
@@ -396,10 +407,7 @@ def _by_lamps(mi: Any, room: Room, solids: tuple[Solid, ...], thrown: int = 0) -
 
         def step(si: Any, weight: Any, light: Any, shown: Any, depth: Any, live: Any, sampler: Any) -> Any:
             sample, factor = si.bsdf().sample(context, si, sampler.next_1d(live), sampler.next_2d(live), live)
-            mirrored = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DeltaReflection)
-            if not known:
-                inside = mi.Frame3f.cos_theta(si.wi) < 0.0
-                shown = dr.select(mirrored, dr.select(inside, mi.UInt32(1), 2), dr.select(shown == 1, mi.UInt32(1), 0))
+            shown = shown if known else _shown_after(mi, sample, si, shown)
             ray = si.spawn_ray(si.to_world(sample.wo))
             weight = weight * factor
             si = things.ray_intersect(ray, live)

@@ -186,7 +186,7 @@ def measure(mi: Any, room: Room, options: Options) -> Measured:
         UsageError: this variant of Mitsuba cannot draw the room.
     """
     loaded = load(mi, room, options.size)
-    wanted = tuple(Light) if room.lamp is not None else (Light.STRAIGHT,)
+    wanted = (Light.STRAIGHT, Light.WORLD, Light.PATH) if room.lamp is not None else (Light.STRAIGHT,)
     truths = {
         light: converged(room, light, loaded, options.reference_samples, options.cache, tell) for light in wanted
     }
