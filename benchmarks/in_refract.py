@@ -20,7 +20,7 @@ from refract_core.scene import (
 )
 
 from .room import constant, surface
-from .two_rooms import IOR, Eye, Finish, Glow, Lamp, Room, Solid
+from .two_rooms import IOR, Eye, Finish, Globe, Glow, Room, Solid, Sun
 
 
 def scene_of(room: Room) -> Scene:
@@ -33,7 +33,7 @@ def scene_of(room: Room) -> Scene:
         tuple(_mesh(solid, index) for index, solid in enumerate(solids)),
         tuple(_material(solid.name, solid.finish, names) for solid in solids),
         textures=tuple(Texture(name, _with_alpha(pixels)) for name, pixels in room.images.items()),
-        lights=(_light(room.lamp),) if room.lamp else (),
+        lights=_lights(room),
         environment=_environment(room.sky) if any(room.sky) else None,
         cameras=(_camera(room.eye),),
         bounds=((low[0], low[1], low[2]), (high[0], high[1], high[2])),
@@ -71,7 +71,8 @@ def _mesh(solid: Solid, index: int) -> Mesh:
 
 def _material(name: str, finish: Finish, images: list[str]) -> Material:
     if finish.glass:
-        return surface(f"/{name}", Model.TRACED, OPACITY=0.0, ROUGHNESS=0.0, IOR=IOR)
+        tint = constant(*finish.tint)
+        return surface(f"/{name}", Model.TRACED, 0.01, OPACITY=0.0, ROUGHNESS=0.0, IOR=IOR, TRANSMITTANCE=tint)
     if finish.radiance is not None:
         return surface(f"/{name}", EMISSIVE=_source(finish.radiance, images))
     assert finish.albedo is not None
@@ -86,8 +87,19 @@ def _with_alpha(pixels: F32) -> F32:
     return np.concatenate([pixels, np.ones_like(pixels[..., :1])], -1)
 
 
-def _light(lamp: Lamp) -> Light:
-    return Light("/lamp", LightKind.RECT, lamp.radiance, lamp.world_from_lamp, lamp.size)
+def _lights(room: Room) -> tuple[Light, ...]:
+    lamp = room.lamp
+    rect = [Light("/lamp", LightKind.RECT, lamp.radiance, lamp.world_from_lamp, lamp.size)] if lamp else []
+    return (*rect, *(_other(light, f"/light{k}") for k, light in enumerate(room.others)))
+
+
+def _other(light: Globe | Sun, path: str) -> Light:
+    if isinstance(light, Globe):
+        m = np.eye(4)
+        m[:3, 3] = light.centre
+        return Light(path, LightKind.SPHERE, light.radiance, m, (light.radius, 0.0))
+    m = looking(Eye(light.towards, (0.0, 0.0, 0.0), 1.0))
+    return Light(path, LightKind.DISTANT, light.radiance, m, (float(np.radians(light.angle)), 0.0))
 
 
 def _environment(sky: tuple[float, float, float]) -> Environment:

@@ -59,7 +59,7 @@ DECIBELS = (31, 33, 37, 43, 45, 49)
 CACHE = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "refract-benchmarks"
 """Where the truth is kept if nobody says otherwise."""
 _WINDOW = 5
-_SAME = 1.0 / 255.0
+SAME = 1.0 / 255.0
 _ENOUGH = 20.0
 """Seconds of counted turns after which more would say nothing new."""
 
@@ -131,12 +131,12 @@ def regions_of(share: F32, straight: F64, world: F64 | None) -> dict[str, Mask]:
     glass = share > 0.0
     if world is None:
         return {"glass": glass, "elsewhere": ~glass}
-    apart = np.abs(_blurred(displayed(straight)) - _blurred(displayed(world))).max(-1)
-    touched = apart > _SAME
+    apart = np.abs(blurred(displayed(straight)) - blurred(displayed(world))).max(-1)
+    touched = apart > SAME
     return {"glass": glass, "untouched": ~glass & ~touched, "touched": ~glass & touched}
 
 
-def _blurred(picture: Picture) -> F64:
+def blurred(picture: Picture) -> F64:
     """Means over windows of 5 x 5 pixels, at the borders over what there is of them."""
     edge = _WINDOW // 2
     padded = np.pad(np.asarray(picture, np.float64), ((edge, edge), (edge, edge), (0, 0)), mode="edge")
@@ -186,9 +186,9 @@ def measure(mi: Any, room: Room, options: Options) -> Measured:
         UsageError: this variant of Mitsuba cannot draw the room.
     """
     loaded = load(mi, room, options.size)
-    wanted = tuple(Light) if room.lamp is not None else (Light.STRAIGHT,)
+    wanted = (Light.STRAIGHT, Light.WORLD, Light.PATH) if room.lamp is not None else (Light.STRAIGHT,)
     truths = {
-        light: converged(room, light, loaded, options.reference_samples, options.cache, _tell) for light in wanted
+        light: converged(room, light, loaded, options.reference_samples, options.cache, tell) for light in wanted
     }
     straight, drawn = truths[Light.STRAIGHT], Light.STRAIGHT if room.lamp is None else Light.WORLD
     truth = truths[drawn]
@@ -209,7 +209,7 @@ def measure(mi: Any, room: Room, options: Options) -> Measured:
     return Measured(runs, best, truth, regions, smallest)
 
 
-def _tell(fraction: float, what: str) -> None:
+def tell(fraction: float, what: str) -> None:
     print(f"\r{what} {100.0 * fraction:3.0f} %", end="" if fraction < 1.0 else "\n", file=sys.stderr, flush=True)
 
 

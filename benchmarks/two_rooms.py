@@ -1,4 +1,4 @@
-"""Two rooms as plain numbers, for any renderer: meshes, finishes, a lamp, a sky and an eye.
+"""Rooms as plain numbers, for any renderer: meshes, finishes, lamps, a sky and an eye.
 
 `emissive_room`: a closed, checkered room in which every opaque surface shines by itself and nothing is lit, with a
 ball, a torus, a blob, a hollow ball, a slab and a pane of glass. What differs between two pictures of it is refraction
@@ -7,8 +7,11 @@ alone.
 `lit_room`: a textured floor and wall, a lamp of one square metre and an even sky, with a ball, a cube, a torus and a
 hollow ball of glass and an opaque ball.
 
+`table_room`: a ball, a cube, a lens and a hollow, tinted bottle of glass and a matt ball on a table, under a lamp of one
+square metre, a globe and a sun of some degrees. `benchmarks.light` draws it.
+
 Everything is in metres, right-handed, Y up. Triangles are counter-clockwise from outside; opaque surfaces shine, and
-are lit, on that side. All glass is closed, clear and smooth, of one index, and touches nothing.
+are lit, on that side. All glass is closed and smooth, of one index, and touches nothing.
 """
 
 from __future__ import annotations
@@ -32,10 +35,12 @@ Glow = Colour | str
 
 
 class Finish(NamedTuple):
-    """What a surface is made of. Exactly one of the three is set."""
+    """What a surface is made of: glass, or one of radiance and albedo."""
 
     glass: bool = False
-    """smooth and clear, of index IOR, in air"""
+    """smooth, of index IOR, in air"""
+    tint: Colour = (1.0, 1.0, 1.0)
+    """of glass: what a centimetre of it lets through"""
     radiance: Glow | None = None
     """it shines, and reflects nothing"""
     albedo: Glow | None = None
@@ -67,6 +72,26 @@ class Lamp(NamedTuple):
     radiance: Colour
 
 
+class Globe(NamedTuple):
+    """A ball that shines, not seen by the eye."""
+
+    centre: tuple[float, float, float]
+    """[m]"""
+    radius: float
+    """[m]"""
+    radiance: Colour
+
+
+class Sun(NamedTuple):
+    """A disk of even light, infinitely far away, not seen by the eye."""
+
+    towards: tuple[float, float, float]
+    """the middle of it; of any length"""
+    angle: float
+    """across [degrees]"""
+    radiance: Colour
+
+
 class Eye(NamedTuple):
     """A pinhole, upright, whose window has 16:9."""
 
@@ -89,11 +114,14 @@ class Room(NamedTuple):
     lamp: Lamp | None = None
     sky: Colour = (0.0, 0.0, 0.0)
     """radiance from everywhere outside"""
+    others: tuple[Globe | Sun, ...] = ()
+    """lights beside the lamp"""
 
     def digest(self) -> str:
         """Changes with every number in the room."""
         found = hashlib.sha256()
-        for part in (self.name, self.eye, self.sky, self.lamp and self.lamp[1:], [s[:2] for s in self.solids]):
+        lights = self.sky, self.lamp and self.lamp[1:], *self.others
+        for part in (self.name, self.eye, *lights, [s[:2] for s in self.solids]):
             found.update(repr(part).encode())
         arrays: list[NDArray[np.generic] | None] = [self.lamp.world_from_lamp if self.lamp else None]
         arrays += [array for solid in self.solids for array in solid[2:]]
@@ -162,6 +190,58 @@ def _torus(name: str, at: F64, radius: float, tube: float) -> Solid:
     p, q = (i * across + j).ravel(), ((i + 1) % around * across + j).ravel()
     r, s = ((i + 1) % around * across + (j + 1) % across).ravel(), (i * across + (j + 1) % across).ravel()
     return _smooth(name, GLASS, points, np.concatenate([np.stack([p, q, r], 1), np.stack([p, r, s], 1)]), at)
+
+
+def _lathe(name: str, finish: Finish, at: F64, profile: F64) -> Solid:
+    """A body turned about y. `profile`: shape (K, 2), distance from y and height [m], from its lowest place on y, on the
+    outside first, to its last one on y."""
+    around = 128
+    turn = 2.0 * np.pi * np.arange(around) / around
+    ring = np.stack([np.cos(turn), 0.0 * turn, -np.sin(turn)], 1)
+    up = np.array([0.0, 1.0, 0.0])
+    rings = [r * ring + y * up for r, y in profile[1:-1]]
+    points = np.concatenate([[profile[0, 1] * up], *rings, [profile[-1, 1] * up]])
+    here, after, last = np.arange(around), (np.arange(around) + 1) % around, len(points) - 1
+    faces = [np.stack([0 * here, 1 + after, 1 + here], 1)]
+    for first in range(1, last - around, around):
+        p, q = first + here, first + after
+        faces += [np.stack([p, q, q + around], 1), np.stack([p, q + around, p + around], 1)]
+    faces.append(np.stack([last - around + here, last - around + after, 0 * here + last], 1))
+    return _smooth(name, finish, points, np.concatenate(faces), at)
+
+
+def _arc(centre: tuple[float, float], radius: float, start: float, stop: float, count: int) -> F64:
+    """Part of a profile: `start` and `stop` are counter-clockwise from outwards [degrees]."""
+    a = np.radians(np.linspace(start, stop, count))
+    return np.stack([centre[0] + radius * np.cos(a), centre[1] + radius * np.sin(a)], 1)
+
+
+def _lens(name: str, at: F64, radius: float, bend: float, rim: float) -> Solid:
+    """Convex on both sides, round about y. `bend`: radius of its surfaces; `rim`: thickness at the edge [m]. Its edge is
+    a smooth arc."""
+    half = float(np.degrees(np.arcsin(radius / bend)))
+    low = float(np.sqrt(bend**2 - radius**2)) - rim / 2.0
+    below = _arc((0.0, low), bend, -90.0, half - 90.0, 49)
+    small = rim / 2.0 / float(np.cos(np.radians(half)))
+    edge = _arc((radius - small * float(np.sin(np.radians(half))), 0.0), small, half - 90.0, 90.0 - half, 9)[1:-1]
+    above = _arc((0.0, -low), bend, 90.0 - half, 90.0, 49)
+    profile = np.concatenate([below, edge, above])
+    profile[[0, -1], 0] = 0.0
+    return _lathe(name, GLASS, at, profile)
+
+
+def _bottle(name: str, finish: Finish, at: F64) -> Solid:
+    """Hollow, open on top, 93 cm high; its walls are 2.5 cm thick, and its base is where y is 0."""
+    belly, neck = (0.12, 0.50), (0.12 + 0.26 * 0.5, 0.50 + 0.26 * 0.75**0.5)  # the shoulder's two arcs, which touch
+    outer = [
+        np.zeros((1, 2)), _arc((0.19, 0.05), 0.05, -90.0, 0.0, 12), _arc(belly, 0.12, 0.0, 60.0, 14),
+        _arc(neck, 0.14, -120.0, -180.0, 14)[1:],
+    ]  # fmt: skip
+    inner = [
+        _arc((0.0975, 0.92), 0.0125, 0.0, 180.0, 12), _arc(neck, 0.165, -180.0, -120.0, 14),
+        _arc(belly, 0.095, 60.0, 0.0, 14)[1:], _arc((0.165, 0.075), 0.05, 0.0, -90.0, 12), np.array([[0.0, 0.025]]),
+    ]  # fmt: skip
+    return _lathe(name, finish, at, np.concatenate([*outer, *inner]))
 
 
 def _block(name: str, at: F64, size: tuple[float, float, float]) -> Solid:
@@ -274,6 +354,27 @@ def lit_room() -> Room:
     images = {"wood": _checkers((0.8, 0.62, 0.45), 0.35), "paint": _checkers((0.5, 0.68, 0.8), 0.6)}
     eye = Eye((0.0, 1.35, 3.2), (0.05, 0.45, 0.0), float(np.tan(np.radians(21.0))))
     return Room("lit", things, images, eye, lamp, (0.50, 0.55, 0.62))
+
+
+def table_room() -> Room:
+    """Three kinds of lights, all that they do through four kinds of glass, and no sky."""
+    lamp = _lamp()
+    amber = Finish(glass=True, tint=(0.96, 0.88, 0.70))
+    things = (
+        _quad("floor", Finish(albedo="wood"), [[-4, 0, 3], [4, 0, 3], [4, 0, -2], [-4, 0, -2]], (8.0, 5.0)),
+        _quad("wall", Finish(albedo=(0.5, 0.62, 0.7)), [[-4, 0, -2], [4, 0, -2], [4, 3, -2], [-4, 3, -2]], (8.0, 3.0)),
+        _ball("matt", Finish(albedo=(0.7, 0.3, 0.2)), place((0.45, 0.28, -1.05)), 0.28, 48),
+        _ball("ball", GLASS, place((-1.0, 0.405, -0.1)), 0.4),
+        _block("cube", place((-0.15, 0.255, 0.5), 30.0), (0.5, 0.5, 0.5)),
+        _lens("lens", place((0.62, 0.42, 0.35), 40.0, 25.0), 0.34, 0.62, 0.02),
+        _bottle("bottle", amber, place((1.35, 0.005, -0.35))),
+        _board(lamp),
+    )
+    images = {"wood": _checkers((0.8, 0.66, 0.5), 0.5)}
+    eye = Eye((0.0, 1.35, 3.2), (0.05, 0.35, 0.0), float(np.tan(np.radians(21.0))))
+    sun = Sun((0.55, 1.0, 0.35), 12.0, (34.0, 30.0, 25.0))
+    globe = Globe((-0.1, 1.75, -1.1), 0.22, (9.0, 10.0, 12.0))
+    return Room("table", things, images, eye, lamp._replace(radiance=(15.0, 14.5, 14.0)), others=(globe, sun))
 
 
 ROOMS: dict[str, Callable[[], Room]] = {"emissive": emissive_room, "lit": lit_room}

@@ -203,6 +203,33 @@ def test_shadow_falls_where_a_line_to_the_light_is_blocked() -> None:
     assert lit[place > 0.76].all()
 
 
+@pytest.mark.parametrize("kind", [LightKind.RECT, LightKind.DISK])
+def test_what_hides_a_part_of_a_lamp_hides_what_that_part_brings(kind: LightKind) -> None:
+    """A lamp that is near and leans, of which a board leaves less and less to the floor below: Lambert's sum over those
+    points of the lamp that the floor sees past the board's edge."""
+    size = (1.6, 1.2) if kind is LightKind.RECT else (0.8, 0.0)
+    lamp = light(kind, (0.3, 0.8, 0.1), (0.5, -1, 0.1), size)
+    edge, height = 0.1, 0.3
+    board = quad("/board", [(-50, height, 50), (edge, height, 50), (edge, height, -50), (-50, height, -50)])
+    below = camera((0, 0.2, 0), (0, 0, 0), 0.3, orthographic=True)
+    what = scene([quad("/floor", FLOOR), board], [WHITE], lights=(lamp,), cameras=(below,))
+    planes = draw(what, 16, 16, samples=16, tolerance=0.03, light_samples=1024)
+    local, area = rect_samples(*size)() if kind is LightKind.RECT else disk_samples(size[0])()
+    m = lamp.world_from_light
+    points = local[::7] @ m[:3, :2].T + m[:3, 3]
+    expected = []
+    for place in (places := planes["P"].reshape(-1, 3).astype(np.float64)):
+        to = points - place
+        free = place[0] + to[:, 0] * height / to[:, 1] > edge
+        brought = np.maximum(to[:, 1], 0) * np.maximum(to @ m[:3, 2], 0) / (to * to).sum(1) ** 2
+        expected.append((brought * free).mean() * area / math.pi)
+    unhidden = factor(lamp, places, np.broadcast_to([0.0, 1, 0], places.shape)) / math.pi
+    shares = np.array(expected) / unhidden
+    assert shares.min() < 0.2
+    assert shares.max() > 0.8
+    np.testing.assert_allclose(planes["beauty"][..., 0].ravel() / unhidden, shares, atol=0.02)
+
+
 def test_glass_casts_no_shadow_and_a_solid_does() -> None:
     """Light is not bent on its way to an opaque surface (no caustics), so it passes glass straight and whole."""
     lamp = light(LightKind.DISTANT, (0, 9, 0), (0, -1, 0.5), (0.0, 0))

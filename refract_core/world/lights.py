@@ -33,6 +33,8 @@ _SMALLEST_POINT_LOBE = 0.02
 """GGX width [alpha] below which a light without size is not sharpened: it would be an infinitely bright dot."""
 _BEYOND = 1e30
 """[m] how far away distant lights are."""
+_LEAST = 1e-12
+"""Weight of a point of a light that brings nothing: alone, it still says whether the light is hidden."""
 _NEAREST2 = 1e-12
 """[m^2] squared distance that a light counts as having at least, so that nothing is divided by 0."""
 
@@ -124,16 +126,21 @@ def lamp_of(lights: LightTable, which: int) -> Lamp:
 def shadow_ray(lights: LightTable, which: int, p: Vec, n: Vec, u1: float, u2: float) -> tuple[Vec, float, float]:
     """(direction, distance, weight) from `p` to one point of a light; distance is along the unit direction [m].
 
-    Points are spread evenly over the light's area as `p` sees it (of a sphere: over the disk it shows), which is what
-    the share of it that is hidden has to be measured by, and weigh 1. Those of what glows are spread by what they bring
-    to a surface with normal `n`, about, and weigh what they really bring. `u1`, `u2`: 0 .. 1.
+    Points are spread evenly over the light's area as `p` sees it (of a sphere: over the disk it shows), those of what
+    glows by what they bring to a surface with normal `n`, about. They weigh what they bring to it, so that the share of
+    a light that is hidden is that of its irradiance: of a lamp that is near, or low, one half is not worth the other.
+    `u1`, `u2`: 0 .. 1.
     """
     if lights.kind[which] == LightKind.GLOW.value:
         point, worth = glow_target(lights.glow, lights.root[which], p, n, u1, u2)
         direction, distance = _towards(p, point)
         return direction, distance, worth * max(0.0, dot(direction, n))
-    direction, distance = target_on(lights.kind[which], lamp_of(lights, which), p, n, u1, u2)
-    return direction, distance, 1.0
+    lamp = lamp_of(lights, which)
+    direction, distance = target_on(lights.kind[which], lamp, p, n, u1, u2)
+    worth = facing_to(lights.kind[which], lamp, p, direction) * dot(direction, n)
+    if lights.kind[which] != LightKind.DISTANT.value:
+        worth /= max(distance * distance, _NEAREST2)
+    return direction, distance, max(_LEAST, worth)
 
 
 @inlined
@@ -318,6 +325,32 @@ def _ball_target(lamp: Lamp, p: Vec, n: Vec, u1: float, u2: float) -> tuple[Vec,
 @inlined
 def _camera_target(lamp: Lamp, p: Vec, n: Vec, u1: float, u2: float) -> tuple[Vec, float]:
     return _towards(p, lamp.centre)
+
+
+# --- how much of a piece of a light faces a place --------------------------------------------------------------------
+
+
+@inlined
+def _flat_facing(lamp: Lamp, p: Vec, d: Vec) -> float:
+    return -dot(d, lamp.face) if lamp.a > 0.0 else 1.0
+
+
+@inlined
+def _sphere_facing(lamp: Lamp, p: Vec, d: Vec) -> float:
+    """Of the disk that it shows."""
+    return dot(d, normalize(sub(lamp.centre, p)))
+
+
+@inlined
+def _cylinder_facing(lamp: Lamp, p: Vec, d: Vec) -> float:
+    """Of the rectangle that it shows."""
+    _, _, w = across(lamp, p)
+    return dot(d, w)
+
+
+@inlined
+def _all_facing(lamp: Lamp, p: Vec, d: Vec) -> float:
+    return 1.0
 
 
 # --- irradiance -----------------------------------------------------------------------------------------------------
@@ -583,6 +616,8 @@ class Kind(NamedTuple):
 
     target: Callable[[Lamp, Vec, Vec, float, float], tuple[Vec, float]]
     """as `shadow_ray`"""
+    facing: Callable[[Lamp, Vec, Vec], float]
+    """(lamp, point, unit direction) -> cosine at the place that a target was drawn on"""
     irradiance: Callable[[Lamp, Vec, Vec], float]
     """as `irradiance_factor`"""
     nearest: Callable[[Lamp, Vec, Vec], Nearest]
@@ -592,15 +627,16 @@ class Kind(NamedTuple):
 
 
 KINDS = {
-    LightKind.DISTANT: Kind(_distant_target, _distant_irradiance, _distant_nearest, (0.5, 0.5)),
-    LightKind.SPHERE: Kind(_sphere_target, _sphere_irradiance, _sphere_nearest),
-    LightKind.RECT: Kind(_rect_target, _rect_irradiance, _rect_nearest, (0.5, 0.5)),
-    LightKind.DISK: Kind(_disk_target, _disk_irradiance, _disk_nearest),
-    LightKind.CYLINDER: Kind(_cylinder_target, _cylinder_irradiance, _cylinder_nearest, (1.0, 0.5)),
-    LightKind.CAMERA: Kind(_camera_target, _camera_irradiance, _camera_nearest),
-    LightKind.BALL: Kind(_ball_target, _sphere_irradiance, _not_near),
+    LightKind.DISTANT: Kind(_distant_target, _all_facing, _distant_irradiance, _distant_nearest, (0.5, 0.5)),
+    LightKind.SPHERE: Kind(_sphere_target, _sphere_facing, _sphere_irradiance, _sphere_nearest),
+    LightKind.RECT: Kind(_rect_target, _flat_facing, _rect_irradiance, _rect_nearest, (0.5, 0.5)),
+    LightKind.DISK: Kind(_disk_target, _flat_facing, _disk_irradiance, _disk_nearest),
+    LightKind.CYLINDER: Kind(_cylinder_target, _cylinder_facing, _cylinder_irradiance, _cylinder_nearest, (1.0, 0.5)),
+    LightKind.CAMERA: Kind(_camera_target, _all_facing, _camera_irradiance, _camera_nearest),
+    LightKind.BALL: Kind(_ball_target, _sphere_facing, _sphere_irradiance, _not_near),
 }
 _CAMERA = KINDS[LightKind.CAMERA]
 target_on = choice({kind: one.target for kind, one in KINDS.items()}, _CAMERA.target)
+facing_to = choice({kind: one.facing for kind, one in KINDS.items()}, _CAMERA.facing)
 _irradiance = choice({kind: one.irradiance for kind, one in KINDS.items()}, _CAMERA.irradiance)
 nearest_to = choice({kind: one.nearest for kind, one in KINDS.items()}, _CAMERA.nearest)
