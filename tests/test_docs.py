@@ -75,6 +75,15 @@ def test_the_page_of_the_command_line_is_what_the_commands_say() -> None:
     assert (ROOT / "docs" / "cli.md").read_text("utf-8") == maker("make_cli_page").page(), text
 
 
+def test_the_gallery_is_what_the_table_of_samples_says_and_has_every_sample() -> None:
+    gallery = maker("make_gallery_page")
+    assert (ROOT / "docs" / "gallery.md").read_text("utf-8") == gallery.page(), "run `python docs/make_gallery_page.py`"
+    shown = [(row.name, row.picture) for row in gallery.rows()]
+    there = {path.stem for path in (ROOT / "usd_samples" / "good").glob("*.usda")}
+    assert sorted(shown) == sorted((name, f"good/{name}.png") for name in there)
+    assert all(f"usd_samples/good/{row.name}.usda" in row.command for row in gallery.rows())
+
+
 def test_the_page_of_the_service_has_its_limits_and_problems() -> None:
     text = (ROOT / "docs" / "service.md").read_text("utf-8")
     assert text == maker("make_service_tables").page(text), "run `python docs/make_service_tables.py`"
