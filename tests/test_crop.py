@@ -237,7 +237,7 @@ def test_what_does_not_fit_together_is_not_joined(tmp_path: Path) -> None:
         "lies outside": (left, part(tmp_path / "c.exr", place=(6, 0, 8, 4))),
         "no part that refract drew": (MARBLE.with_suffix(".png"), ),
         "is no .exr": (left, MARBLE.with_suffix(".png")),
-        "not a readable image": (left, tmp_path / "gone.exr"),
+        "gone.exr: there is no such file": (left, tmp_path / "gone.exr"),
     }
     for said, parts in wrong.items():
         target = out if parts[0].suffix == ".exr" else tmp_path / "out.png"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -113,6 +114,8 @@ def _read(path: str) -> _Piece:
     """Pixels as they are stored: 8 bits, halves, or floats that halves are in exactly."""
     import OpenImageIO as oiio
 
+    if not Path(path).is_file():
+        raise ImageError(f"{path}: there is no such file; draw that part first, or correct the path")
     config = oiio.ImageSpec()
     config.attribute(STRAIGHT_ALPHA, 1)
     file = oiio.ImageInput.open(path, config)
