@@ -1,6 +1,6 @@
 """A room of `two_rooms` as a scene of Mitsuba 3, and its pictures by path tracing.
 
-Both rooms are drawn by short integrators of Mitsuba's parts, written here, that follow light from the eye through glass
+The rooms are drawn by short integrators of Mitsuba's parts, written here, that follow light from the eye through glass
 to the first surface that is not. In the emissive room that is all. In the lit one the surface is lit directly: by one
 sample of the lamp or the sky and one of the surface, weighted (Veach's power heuristic), so that matt surfaces do not
 light each other, which would hide everything else that differs between two renderers. `Light` says what glass does to
@@ -44,7 +44,8 @@ class Light(StrEnum):
     """Nothing: glass casts no shadow and no caustic, and the lamp is seen only as the highlight on the outside of
     glass. It tells, beside the next, what caustics touch."""
     WORLD = "world"
-    """In rooms without `others`: all it does: shadows, caustics, the lamp through glass. Only matt surfaces still do not light each other."""
+    """All it does: shadows, caustics, the lamp through glass. Only matt surfaces still do not light each other. Not in
+    rooms with `others`."""
     PATH = "path"
     """The same, and matt surfaces light each other: Mitsuba's own `path`, as anybody would use it."""
     ONCE = "once"
@@ -369,7 +370,8 @@ def _by_lamps(mi: Any, room: Room, solids: tuple[Solid, ...], thrown: int = 0) -
 
     Args:
         solids: what light meets on its way; eyes look at all of the room.
-        thrown: rays that each lamp throws at glass beforehand, in place of those that flat surfaces send (`Light.THROWN`).
+        thrown: rays that each lamp throws at glass beforehand, in place of those that flat surfaces send
+            (`Light.THROWN`).
     """
     dr = importlib.import_module("drjit")
     context = mi.BSDFContext()
