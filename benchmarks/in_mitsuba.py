@@ -518,9 +518,15 @@ def _ball_around(solid: Solid) -> tuple[list[float], float]:
 def _meets(mi: Any, light: Lamp | Globe | Sun) -> tuple[Any, Colour]:
     """(ray, distance) -> whether the ray meets the light's bright side before that; and its radiance. In plain
     arithmetic, which is many times faster than a scene."""
+    if isinstance(light, Lamp):
+        return _meets_lamp(mi, light), light.radiance
+    return _meets_globe(mi, light) if isinstance(light, Globe) else _meets_sun(mi, light), light.radiance
+
+
+def _meets_lamp(mi: Any, light: Lamp) -> Any:
     dr = importlib.import_module("drjit")
 
-    def rectangle(ray: Any, before: Any) -> Any:
+    def meets(ray: Any, before: Any) -> Any:
         x, y, z, at = (mi.Vector3f(*light.world_from_lamp[:3, k].tolist()) for k in range(4))
         cosine = -dr.dot(ray.d, z)
         t = dr.dot(ray.o - at, z) / cosine
@@ -528,17 +534,29 @@ def _meets(mi: Any, light: Lamp | Globe | Sun) -> tuple[Any, Colour]:
         within = (abs(dr.dot(p, x)) < light.size[0] / 2.0) & (abs(dr.dot(p, y)) < light.size[1] / 2.0)
         return within & (cosine < 0.0) & (t > 0.0) & (t < before)
 
-    def globe(ray: Any, before: Any) -> Any:
+    return meets
+
+
+def _meets_globe(mi: Any, light: Globe) -> Any:
+    dr = importlib.import_module("drjit")
+
+    def meets(ray: Any, before: Any) -> Any:
         to = mi.Point3f(*light.centre) - ray.o
         along = dr.dot(to, ray.d)
         inner = light.radius**2 - dr.squared_norm(to - along * ray.d)
         return (inner > 0.0) & (along > 0.0) & (along - dr.sqrt(dr.maximum(inner, 0.0)) < before)
 
-    def sun(ray: Any, before: Any) -> Any:
+    return meets
+
+
+def _meets_sun(mi: Any, light: Sun) -> Any:
+    dr = importlib.import_module("drjit")
+
+    def meets(ray: Any, before: Any) -> Any:
         towards = dr.normalize(mi.Vector3f(*light.towards))
         return (dr.dot(ray.d, towards) > np.cos(np.radians(light.angle / 2.0))) & dr.isinf(before)
 
-    return {Lamp: rectangle, Globe: globe, Sun: sun}[type(light)], light.radiance
+    return meets
 
 
 def _leaves(mi: Any, light: Lamp | Globe | Sun, balls: Any, sampler: Any, to_balls: Any) -> tuple[Any, Any]:

@@ -16,9 +16,9 @@ table; it is not counted as anybody's error (`peers.scores`), but what is far be
     caustic     what is brighter
     glass       pixels in which glass is met first
 
-"Mitsuba" is that integrator from the eye's side alone (`Light.ONCE`), against the same truth. "Mitsuba path" is its own,
-against its own converged picture: matt surfaces light each other, lamps are seen through glass and hide each other, and
-the bottle is clear, as `path` knows no absorption. It has the same number of samples for its truth.
+"Mitsuba" is that integrator from the eye's side alone (`Light.ONCE`), against the same truth. "Mitsuba path" is its
+own, against its own converged picture: matt surfaces light each other, lamps are seen through glass and hide each
+other, and the bottle is clear, as `path` knows no absorption. It has the same number of samples for its truth.
 
 `--knobs` draws with one setting after the other changed: what each brings to `good`, and what it costs.
 
