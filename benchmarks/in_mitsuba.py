@@ -1,6 +1,6 @@
 """A room of `two_rooms` as a scene of Mitsuba 3, and its pictures by path tracing.
 
-Both rooms are drawn by short integrators of Mitsuba's parts, written here, that follow light from the eye through glass
+The rooms are drawn by short integrators of Mitsuba's parts, written here, that follow light from the eye through glass
 to the first surface that is not. In the emissive room that is all. In the lit one the surface is lit directly: by one
 sample of the lamp or the sky and one of the surface, weighted (Veach's power heuristic), so that matt surfaces do not
 light each other, which would hide everything else that differs between two renderers. `Light` says what glass does to
@@ -44,7 +44,8 @@ class Light(StrEnum):
     """Nothing: glass casts no shadow and no caustic, and the lamp is seen only as the highlight on the outside of
     glass. It tells, beside the next, what caustics touch."""
     WORLD = "world"
-    """In rooms without `others`: all it does: shadows, caustics, the lamp through glass. Only matt surfaces still do not light each other."""
+    """All it does: shadows, caustics, the lamp through glass. Only matt surfaces still do not light each other. Not in
+    rooms with `others`."""
     PATH = "path"
     """The same, and matt surfaces light each other: Mitsuba's own `path`, as anybody would use it."""
     ONCE = "once"
@@ -369,7 +370,8 @@ def _by_lamps(mi: Any, room: Room, solids: tuple[Solid, ...], thrown: int = 0) -
 
     Args:
         solids: what light meets on its way; eyes look at all of the room.
-        thrown: rays that each lamp throws at glass beforehand, in place of those that flat surfaces send (`Light.THROWN`).
+        thrown: rays that each lamp throws at glass beforehand, in place of those that flat surfaces send
+            (`Light.THROWN`).
     """
     dr = importlib.import_module("drjit")
     context = mi.BSDFContext()
@@ -516,9 +518,15 @@ def _ball_around(solid: Solid) -> tuple[list[float], float]:
 def _meets(mi: Any, light: Lamp | Globe | Sun) -> tuple[Any, Colour]:
     """(ray, distance) -> whether the ray meets the light's bright side before that; and its radiance. In plain
     arithmetic, which is many times faster than a scene."""
+    if isinstance(light, Lamp):
+        return _meets_lamp(mi, light), light.radiance
+    return _meets_globe(mi, light) if isinstance(light, Globe) else _meets_sun(mi, light), light.radiance
+
+
+def _meets_lamp(mi: Any, light: Lamp) -> Any:
     dr = importlib.import_module("drjit")
 
-    def rectangle(ray: Any, before: Any) -> Any:
+    def meets(ray: Any, before: Any) -> Any:
         x, y, z, at = (mi.Vector3f(*light.world_from_lamp[:3, k].tolist()) for k in range(4))
         cosine = -dr.dot(ray.d, z)
         t = dr.dot(ray.o - at, z) / cosine
@@ -526,17 +534,29 @@ def _meets(mi: Any, light: Lamp | Globe | Sun) -> tuple[Any, Colour]:
         within = (abs(dr.dot(p, x)) < light.size[0] / 2.0) & (abs(dr.dot(p, y)) < light.size[1] / 2.0)
         return within & (cosine < 0.0) & (t > 0.0) & (t < before)
 
-    def globe(ray: Any, before: Any) -> Any:
+    return meets
+
+
+def _meets_globe(mi: Any, light: Globe) -> Any:
+    dr = importlib.import_module("drjit")
+
+    def meets(ray: Any, before: Any) -> Any:
         to = mi.Point3f(*light.centre) - ray.o
         along = dr.dot(to, ray.d)
         inner = light.radius**2 - dr.squared_norm(to - along * ray.d)
         return (inner > 0.0) & (along > 0.0) & (along - dr.sqrt(dr.maximum(inner, 0.0)) < before)
 
-    def sun(ray: Any, before: Any) -> Any:
+    return meets
+
+
+def _meets_sun(mi: Any, light: Sun) -> Any:
+    dr = importlib.import_module("drjit")
+
+    def meets(ray: Any, before: Any) -> Any:
         towards = dr.normalize(mi.Vector3f(*light.towards))
         return (dr.dot(ray.d, towards) > np.cos(np.radians(light.angle / 2.0))) & dr.isinf(before)
 
-    return {Lamp: rectangle, Globe: globe, Sun: sun}[type(light)], light.radiance
+    return meets
 
 
 def _leaves(mi: Any, light: Lamp | Globe | Sun, balls: Any, sampler: Any, to_balls: Any) -> tuple[Any, Any]:

@@ -72,7 +72,7 @@ class Entrant(NamedTuple):
     picture: Callable[[int], F32]
     """turn -> shape (H, W, 3), linear. Where there is noise it is another one in every turn."""
     truth: Picture
-    """What it would be with samples without end, shape (H, W, 3), linear"""
+    """What it would be with samples without end, linear; as `scores`"""
 
 
 class Run(NamedTuple):
@@ -144,9 +144,19 @@ def blurred(picture: Picture) -> F64:
 
 
 def scores(linear: Picture, truth: Picture, regions: dict[str, Mask]) -> dict[str, float]:
-    """PSNR by region [dB]; nan where a region is empty."""
-    pair = displayed(linear), displayed(truth)
-    return {name: psnr(*pair, mask) if mask.any() else math.nan for name, mask in regions.items()}
+    """PSNR by region [dB]; nan where a region is empty.
+
+    Args:
+        truth: shape (H, W, 3); or (2, H, W, 3), two independent halves of it. The mean product of what parts the
+            picture from each is free of the truth's own noise, which is in each half another.
+    """
+    if truth.ndim == 3:
+        pair = displayed(linear), displayed(truth)
+        return {name: psnr(*pair, mask) if mask.any() else math.nan for name, mask in regions.items()}
+    shown = displayed(linear).astype(np.float64)
+    products = np.prod([shown - displayed(half) for half in truth], axis=0)
+    means = {name: products[mask].mean() if mask.any() else math.nan for name, mask in regions.items()}
+    return {name: math.inf if mean <= 0.0 else -10.0 * math.log10(mean) for name, mean in means.items()}
 
 
 def race(entrants: Sequence[Entrant], regions: dict[str, Mask], repeat: int) -> list[Run]:

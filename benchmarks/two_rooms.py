@@ -7,8 +7,8 @@ alone.
 `lit_room`: a textured floor and wall, a lamp of one square metre and an even sky, with a ball, a cube, a torus and a
 hollow ball of glass and an opaque ball.
 
-`table_room`: a ball, a cube, a lens and a hollow, tinted bottle of glass and a matt ball on a table, under a lamp of one
-square metre, a globe and a sun of some degrees. `benchmarks.light` draws it.
+`table_room`: a ball, a cube, a lens and a hollow, tinted bottle of glass and a matt ball on a table, under a lamp of
+one square metre, a globe and a sun of some degrees. `benchmarks.light` draws it.
 
 Everything is in metres, right-handed, Y up. Triangles are counter-clockwise from outside; opaque surfaces shine, and
 are lit, on that side. All glass is closed and smooth, of one index, and touches nothing.
@@ -193,8 +193,8 @@ def _torus(name: str, at: F64, radius: float, tube: float) -> Solid:
 
 
 def _lathe(name: str, finish: Finish, at: F64, profile: F64) -> Solid:
-    """A body turned about y. `profile`: shape (K, 2), distance from y and height [m], from its lowest place on y, on the
-    outside first, to its last one on y."""
+    """A body turned about y. `profile`: shape (K, 2), distance from y and height [m], from its lowest place on y, on
+    the outside first, to its last one on y."""
     around = 128
     turn = 2.0 * np.pi * np.arange(around) / around
     ring = np.stack([np.cos(turn), 0.0 * turn, -np.sin(turn)], 1)
@@ -217,8 +217,8 @@ def _arc(centre: tuple[float, float], radius: float, start: float, stop: float, 
 
 
 def _lens(name: str, at: F64, radius: float, bend: float, rim: float) -> Solid:
-    """Convex on both sides, round about y. `bend`: radius of its surfaces; `rim`: thickness at the edge [m]. Its edge is
-    a smooth arc."""
+    """Convex on both sides, round about y. `bend`: radius of its surfaces; `rim`: thickness at the edge [m]. Its edge
+    is a smooth arc."""
     half = float(np.degrees(np.arcsin(radius / bend)))
     low = float(np.sqrt(bend**2 - radius**2)) - rim / 2.0
     below = _arc((0.0, low), bend, -90.0, half - 90.0, 49)
