@@ -12,6 +12,7 @@ from .app import Jobs, Mask, ProgressMode, Quiet, SessionLayer, Variant, Verbose
 from .render import (
     Camera,
     DisableCameraLight,
+    DisableMotionBlur,
     Exposure,
     ImageHeight,
     ImageWidth,
@@ -81,6 +82,7 @@ def compare_command(
     screen: Screen = None,
     model: ModelName = None,
     exposure: Exposure = None,
+    disable_motion_blur: DisableMotionBlur = False,
     disable_camera_light: DisableCameraLight = False,
     render_settings_prim_path: SettingsPrim = "",
     variant: Variant = None,
@@ -113,6 +115,7 @@ def compare_command(
         "screen": screen,
         "model": model,
         "exposure": exposure,
+        "motion_blur": False if disable_motion_blur else None,
         "camera_light": False if disable_camera_light else None,
         "jobs": jobs,
     }
@@ -132,10 +135,12 @@ def compare_command(
             flags = {
                 "--suggest": suggest, "--write": write, "--frame": frame is not None,
                 "--reference-samples": reference_samples != SAMPLES, "--disable-camera-light": disable_camera_light,
+                "--disable-motion-blur": disable_motion_blur,
                 "--render-settings-prim-path": render_settings_prim_path,
                 "--variant": variant, "--session-layer": session_layer, "--mask": mask,
             }  # fmt: skip
-            named = [f"--{name.replace('_', '-')}" for name in given if name not in ("camera_light", "jobs")]
+            switches = ("camera_light", "motion_blur", "jobs")
+            named = [f"--{name.replace('_', '-')}" for name in given if name not in switches]
             _refuse(first, [flag for flag in (*named, *filter(flags.get, flags)) if _typed(ctx, flag)])
             account = _of_pictures(first, second, third, how)
             out = third
