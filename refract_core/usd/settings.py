@@ -59,7 +59,8 @@ def read_settings(
 
 
 def frame_of(prim: Usd.Prim) -> dict[str, object]:
-    """Camera, resolution and motion blur that a RenderSettings or RenderProduct prim authors, as fields of `RenderSettings`.
+    """What a RenderSettings or RenderProduct prim authors of camera, resolution and motion blur, as fields of
+    `RenderSettings`.
 
     Raises:
         StageError: a resolution that no picture can have.
