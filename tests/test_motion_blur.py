@@ -190,6 +190,23 @@ KINDS = {
     "point3f[] positions.timeSamples = { -0.5: [(-1, 0, 0), (1, 0, 0)], 0.5: [(-1, -1, 0), (1, 1, 0)] }\n"
     + card() + "}",
     "visibility": card('token visibility.timeSamples = { -0.5: "inherited", 0.1: "invisible" }'),
+    "skeleton": 'def SkelRoot "Body" { '
+    + card("""rel skel:skeleton = </Body/Bones>
+        int[] primvars:skel:jointIndices = [0, 0, 0, 0] (elementSize = 1
+            interpolation = "vertex")
+        float[] primvars:skel:jointWeights = [1, 1, 1, 1] (elementSize = 1
+            interpolation = "vertex")""").replace('"Card"', '"Card" (prepend apiSchemas = ["SkelBindingAPI"])')
+    + """def Skeleton "Bones" (prepend apiSchemas = ["SkelBindingAPI"]) {
+        uniform token[] joints = ["a"]
+        uniform matrix4d[] bindTransforms = [((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))]
+        uniform matrix4d[] restTransforms = [((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))]
+        rel skel:animationSource = </Body/Walk> }
+    def SkelAnimation "Walk" {
+        uniform token[] joints = ["a"]
+        float3[] translations.timeSamples = { -0.5: [(-0.5, 0, 0)], 0.5: [(0.5, 0.4, 0)] }
+        quatf[] rotations = [(1, 0, 0, 0)]
+        half3[] scales = [(1, 1, 1)] } }
+    """,
     "colour": card().replace("displayColor = [(0.8, 0.4, 0.2)]",
                              "displayColor.timeSamples = { -0.5: [(0.1, 0.4, 0)], 0.5: [(0.9, 0, 0.2)] }"),
     "light": card() + 'def DistantLight "L" { float inputs:intensity.timeSamples = { -0.5: 0, 0.5: 4 } }',

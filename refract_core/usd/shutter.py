@@ -33,7 +33,10 @@ def with_shutters(
 
 
 def _shutter(camera: UsdGeom.Camera, time: Usd.TimeCode, notices: list[Notice]) -> tuple[float, float]:
-    """When it opens and closes; the same where it does not, or where its attributes are no span of time."""
+    """When it opens and closes; the same where it does not, where its attributes are no span of time, or where the
+    stage has no such camera."""
+    if not camera:
+        return CLOSED
     opens, closes = (float(attribute.Get(time) or 0.0)
                      for attribute in (camera.GetShutterOpenAttr(), camera.GetShutterCloseAttr()))  # fmt: skip
     if opens == closes:
