@@ -107,7 +107,7 @@ def compare_command(
     from ..verbs.compare_report import to_json, to_text
 
     drawing = {
-        "camera": camera,
+        "camera": camera[0] if camera else None,
         "image_width": image_width,
         "image_height": image_height,
         "samples": samples,
@@ -122,6 +122,8 @@ def compare_command(
     given = {name: value for name, value in drawing.items() if value is not None}
     how = {"fail_under": fail_under, "overwrite": overwrite}
     with outcome(progress, quiet, verbose) as (report, cancel):
+        if camera and len(camera) > 1:
+            raise UsageError("--camera may be given once: what is compared is one picture")
         if _is_stage(first):
             if third:
                 raise UsageError(f"{third}: is one word too many; a stage takes one folder, as in STAGE OUTDIR")
