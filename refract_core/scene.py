@@ -433,6 +433,9 @@ class Camera:
     """[m]; 0 is a pinhole, which has everything in focus. For perspective."""
     focus_distance: float = 1.0
     """[m] along the camera axis: what is there is sharp however wide the lens is."""
+    shutter: tuple[float, float] = (0.0, 0.0)
+    """open, close [time codes after that of the frame], where something moves in between; alike, it shows one
+    instant."""
     framing: bool = False
     """Made to frame everything: a picture of another aspect is framed anew (`view.orbit`)."""
 

@@ -132,6 +132,8 @@ class RenderSettings:
     exposure: float = 0.0
     """Stops added to the camera's own exposure, -64 .. 64."""
     purposes: tuple[str, ...] = ("default", "render")
+    motion_blur: bool = True
+    """What moves while the camera's shutter is open is blurred. Otherwise it stands still at the time of the frame."""
     camera_light: bool = True
     """Light is added where a stage has no light, no dome and nothing that glows: a studio, or, where there is none, a
     lamp at the camera."""

@@ -69,6 +69,7 @@ class RenderSettings(TypedDict, total=False):
     max_layers: int
     denoise: bool
     exposure: float
+    motion_blur: bool
     camera_light: bool
     emission_light: bool
     studio: str

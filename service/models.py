@@ -101,6 +101,7 @@ class Render(StageOnly):
         None, description="take the noise out of the picture with Open Image Denoise; other planes stay"
     )
     exposure: Annotated[float, Field(ge=-64.0, le=64.0)] | None = None
+    motion_blur: bool | None = None
     camera_light: bool | None = None
     emission_light: bool | None = None
     studio: Literal["softbox", "daylight", "dark", "none"] | None = None

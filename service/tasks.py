@@ -44,8 +44,8 @@ _UNITS = ("Z", "thickness", "path_length", "layers")
 """Planes that are not between 0 and 1: their PNG is scaled, and says by how much."""
 _SETTINGS = ("camera", "image_width", "image_height", "quality", "preset", "samples", "tolerance", "light_samples",
              "caustics", "indirect", "cut", "tiers", "screen", "model", "max_layers", "denoise", "exposure",
-             "camera_light", "emission_light", "studio", "background", "purposes", "azimuth", "elevation", "distance",
-             "fit", "fov", "focal_length", "look_at")  # fmt: skip
+             "motion_blur", "camera_light", "emission_light", "studio", "background", "purposes", "azimuth",
+             "elevation", "distance", "fit", "fov", "focal_length", "look_at")  # fmt: skip
 
 
 def laid_out(stage: str, root: str, settings: Mapping[str, Any], limits: Mapping[str, int]) -> tuple[str, str]:
@@ -204,8 +204,15 @@ def _render(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[s
         _check_sizes(measured, len(times), wanted.samples, settings["format"], limits)
         scene = overridden(scene, overrides)
         told += scene.notices
+
+        def scene_at(time_code: float, chosen: dict[str, Any] = chosen) -> Scene:
+            then = scene_from_stage(opened, time_code=time_code, **chosen)
+            check_scene(then, limits)
+            return override(then, overrides, strict=False)  # what it names may be hidden then
+
         for size in sizes:
-            frame = render(scene, _sized(wanted, size), session=session, progress=_share_of(say, len(done), count))
+            progress = _share_of(say, len(done), count)
+            frame = render(scene, _sized(wanted, size), session=session, progress=progress, scene_at=scene_at)
             told += frame.notices
             frame = replace(frame, metadata={**frame.metadata, **override_notes(overrides)})
             _save_picture(frame, out, settings, f"picture.{len(done)}" if count > 1 else "image")

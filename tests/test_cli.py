@@ -61,6 +61,7 @@ class Engine:
         cancel: Callable[[], bool] | None = None,
         session: rc.Session | None = None,
         watch: object = None,
+        scene_at: Callable[[float], rc.Scene] | None = None,
     ) -> rc.Frame:
         assert settings is not None
         assert progress is not None
@@ -117,6 +118,7 @@ def test_without_flags_the_defaults_are_rendered(engine: Engine, tmp_path: Path)
 def test_every_flag_reaches_its_setting(engine: Engine, tmp_path: Path) -> None:
     words = "--camera /Cam -w 40 --image-height 30 --samples 9 --tiers ray,sky --screen proxy --model box "
     words += "--max-layers 2 --purposes guide,default --exposure -1.5 --disable-camera-light --jobs 2 --tile-size 32 "
+    words += "--disable-motion-blur "
     words += "--render-settings-prim-path /Render/A"
     assert refract("render", "a.usda", tmp_path / "a.png", *words.split()).code == 0
     assert engine.settings == [
@@ -130,6 +132,7 @@ def test_every_flag_reaches_its_setting(engine: Engine, tmp_path: Path) -> None:
             model="box",
             max_layers=2,
             exposure=-1.5,
+            motion_blur=False,
             camera_light=False,
             purposes=("default", "guide"),
             jobs=2,

@@ -388,6 +388,8 @@ def test_an_earlier_report_is_replaced_and_other_folders_are_not(tmp_path: Path)
         (["a.exr", "a.exr", "no/folder"], 2, "no/folder: the folder no does not exist"),
         (["a.exr", "a.exr", "a.exr"], 2, "a.exr: is a file"),
         (["stage.usda", "out", "more"], 2, "more: is one word too many"),
+        (["stage.usda", "out", "--camera", "none"], 2, "camera 'none' does not exist"),
+        (["stage.usda", "out", "--camera", "a", "--camera", "b"], 2, "--camera may be given once"),
         (["stage.usda", "out", "--write", "b.usda"], 2, "add --suggest"),
         (["stage.usda", "out", "--suggest", "--model", "thin"], 2, "leave out --model"),
         (["stage.usda", "out", "--suggest", "--write", "stage.usda"], 2, "input is never changed"),

@@ -12,6 +12,7 @@ from .app import Jobs, Mask, ProgressMode, Quiet, SessionLayer, Variant, Verbose
 from .render import (
     Camera,
     DisableCameraLight,
+    DisableMotionBlur,
     Exposure,
     ImageHeight,
     ImageWidth,
@@ -81,6 +82,7 @@ def compare_command(
     screen: Screen = None,
     model: ModelName = None,
     exposure: Exposure = None,
+    disable_motion_blur: DisableMotionBlur = False,
     disable_camera_light: DisableCameraLight = False,
     render_settings_prim_path: SettingsPrim = "",
     variant: Variant = None,
@@ -105,7 +107,7 @@ def compare_command(
     from ..verbs.compare_report import to_json, to_text
 
     drawing = {
-        "camera": camera,
+        "camera": camera[0] if camera else None,
         "image_width": image_width,
         "image_height": image_height,
         "samples": samples,
@@ -113,12 +115,15 @@ def compare_command(
         "screen": screen,
         "model": model,
         "exposure": exposure,
+        "motion_blur": False if disable_motion_blur else None,
         "camera_light": False if disable_camera_light else None,
         "jobs": jobs,
     }
     given = {name: value for name, value in drawing.items() if value is not None}
     how = {"fail_under": fail_under, "overwrite": overwrite}
     with outcome(progress, quiet, verbose) as (report, cancel):
+        if camera and len(camera) > 1:
+            raise UsageError("--camera may be given once: what is compared is one picture")
         if _is_stage(first):
             if third:
                 raise UsageError(f"{third}: is one word too many; a stage takes one folder, as in STAGE OUTDIR")
@@ -132,10 +137,12 @@ def compare_command(
             flags = {
                 "--suggest": suggest, "--write": write, "--frame": frame is not None,
                 "--reference-samples": reference_samples != SAMPLES, "--disable-camera-light": disable_camera_light,
+                "--disable-motion-blur": disable_motion_blur,
                 "--render-settings-prim-path": render_settings_prim_path,
                 "--variant": variant, "--session-layer": session_layer, "--mask": mask,
             }  # fmt: skip
-            named = [f"--{name.replace('_', '-')}" for name in given if name not in ("camera_light", "jobs")]
+            switches = ("camera_light", "motion_blur", "jobs")
+            named = [f"--{name.replace('_', '-')}" for name in given if name not in switches]
             _refuse(first, [flag for flag in (*named, *filter(flags.get, flags)) if _typed(ctx, flag)])
             account = _of_pictures(first, second, third, how)
             out = third

@@ -222,6 +222,13 @@ DisableCameraLight = Annotated[
         help="Add no light where the stage has none: no studio by itself, and none from the camera.",
     ),
 ]
+DisableMotionBlur = Annotated[
+    bool,
+    typer.Option(
+        "--disable-motion-blur",
+        help="Let everything stand still at the time of the frame, however long the camera's shutter is open.",
+    ),
+]
 DisableEmissionLight = Annotated[
     bool,
     typer.Option(
@@ -364,6 +371,7 @@ def render(
     exr_compression: ExrCompression = USUAL.compression,
     exr_parts: ExrParts = USUAL.parts,
     exposure: Exposure = None,
+    disable_motion_blur: DisableMotionBlur = False,
     disable_camera_light: DisableCameraLight = False,
     disable_emission_light: DisableEmissionLight = False,
     studio: Studio = None,
@@ -412,6 +420,7 @@ def render(
             "denoise": denoise or None,
             "cryptomatte": None if cryptomatte is None else words(cryptomatte),
             "exposure": exposure,
+            "motion_blur": False if disable_motion_blur else None,
             "camera_light": False if disable_camera_light else None,
             "emission_light": False if disable_emission_light else None,
             "studio": studio,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -69,12 +69,16 @@ class Tree:
     """
 
     def __init__(
-        self, ready: Ready, scene: Scene, camera: Camera, settings: RenderSettings, window: Tile, planes: Planes
-    ) -> None:
+        self, ready: Ready, scene: Scene, camera: Camera, settings: RenderSettings, window: Tile, planes: Planes,
+        samples: Sequence[int] = (), before: int = 0,
+    ) -> None:  # fmt: skip
         """
         Args:
             window: pixels that are wanted; of the others the planes get whatever is drawn along with those.
+            samples: those of the settings' that are drawn, where each is a picture of its own; () is all of them.
+            before: samples that the planes have already.
         """
+        self.samples, self.before = samples or range(settings.samples), before
         height, width = planes.mask.shape
         self.ready, self.camera, self.settings, self.planes = ready, camera, settings, planes
         self.window = window
@@ -112,9 +116,9 @@ class Tree:
         if self.by_corners:
             yield from self._corner_passes()
             return
-        samples = self.settings.samples
-        for sample, view in enumerate(sample_views(self.camera, self.size, samples)):
-            yield from self._sample_passes(view, sample, 1.0 / samples)
+        views = list(sample_views(self.camera, self.size, self.settings.samples))
+        for done, sample in enumerate(self.samples, self.before + 1):
+            yield from self._sample_passes(views[sample], sample, 1.0 / self.settings.samples, done)
 
     def _corner_passes(self) -> Iterator[Pass]:
         settings, (width, height) = self.settings, self.size
@@ -206,7 +210,7 @@ class Tree:
                 wanted |= set(meeting(patches, (at[0] - PATCH, at[1] - PATCH, at[0] + PATCH, at[1] + PATCH)))
             wanted -= drawn
 
-    def _sample_passes(self, view: View, sample: int, share: float) -> Iterator[Pass]:
+    def _sample_passes(self, view: View, sample: int, share: float, done: int) -> Iterator[Pass]:
         world, asking, camera = self.ready.world, by_address(self._asking(view)), by_address(view)
         opaque, target = by_address(self.opaque), by_address(self.planes)
 
@@ -220,7 +224,7 @@ class Tree:
             tree = scratch(TreeScratch)
             return int(tree_tile(world, asking, self.rules, self.view_ray, tree, tile, sample, opaque, target))
 
-        yield Pass(grow, self.tiles, 0.7 * share, sample + 1)
+        yield Pass(grow, self.tiles, 0.7 * share, done)
 
     def _quiet_passes(self, view: View, share: float, part: Tile) -> Iterator[Pass]:
         """Draw a part of the corners' picture without glass, as far as it is not there yet."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -39,25 +40,34 @@ class Found(NamedTuple):
 
 def features_of(
     ready: Ready, scene: Scene, camera: Camera, settings: RenderSettings, size: tuple[int, int], work: Work,
-    window: Tile,
+    window: Tile, of_picture: Sequence[int] = (),
 ) -> Found:  # fmt: skip
-    """Draw the planes `albedo` and `denoising_normal`, of a window of the picture."""
+    """Draw the planes `albedo` and `denoising_normal`, of a window of the picture.
+
+    Args:
+        of_picture: which of the picture's own samples to draw; () is as many of their own as edges and lens need.
+    """
     width, height = size
-    samples = min(settings.samples, _LENS_SAMPLES if camera.lens_radius > 0.0 else _SAMPLES)
+    if of_picture:
+        every = list(sample_views(camera, size, settings.samples))
+        views = {sample: every[sample] for sample in of_picture}
+    else:
+        samples = min(settings.samples, _LENS_SAMPLES if camera.lens_radius > 0.0 else _SAMPLES)
+        views = dict(enumerate(sample_views(camera, size, samples)))
     sums = Features(np.zeros((height, width, 3), np.float32), np.zeros((height, width, 3), np.float32))
     rules = by_address(Rules(settings.max_layers, max(settings.cut, _CUT), settings.screen != "proxy"))
     start, target = by_address(view_ray(scene, camera, settings.model)), by_address(sums)
     tiles = meeting(tiles_of(width, height, settings.tile_size), window)
     rays = 0
-    for sample, view in enumerate(sample_views(camera, size, samples)):
+    for sample, view in views.items():
         seen = by_address(view)
 
         def look(tile: Tile, seen: View = seen, sample: int = sample) -> int:
             return int(features_tile(ready.world, seen, rules, start, scratch(TreeScratch), tile, sample, target))
 
         rays += sum(work.run(look, tiles))
-    turn = finish_of(scene, samples, 1.0).stage_rotation
-    share = np.float32(1.0 / samples)
+    turn = finish_of(scene, len(views), 1.0).stage_rotation
+    share = np.float32(1.0 / len(views))
     sums = Features(*(part_of(plane, window) for plane in sums))
     normal = (sums.normal * share) @ turn.T.astype(np.float32)
     return Found(sums.albedo * share, np.ascontiguousarray(normal, np.float32), rays)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -37,10 +37,12 @@ from ..world.embree import Bvh
 from ..world.instances import settled, thing_count, within
 from ..world.tables import World
 from .branching import Tree, needs_compiling, sample_views
-from .features import features_of, without_noise
+from .features import Found, features_of, without_noise
+from .integrator import Pass
 from .mattes import draw_mattes
 from .ready import PROBE_SAMPLES, Ready, camera_of, prepare, prepare_bare
 from .session import Session
+from .shutter import Instant, Moment, moments_of, shutter_of_few
 from .unfinished import FINISHED, Drawn, Watch
 from .work import Cancel, Progress, Work, tiles_of, working
 
@@ -60,6 +62,7 @@ def render(
     executor: Executor | None = None,
     session: Session | None = None,
     watch: Watch | None = None,
+    scene_at: Callable[[float], Scene] | None = None,
 ) -> Frame:
     """Render one picture of a scene.
 
@@ -69,6 +72,8 @@ def render(
         executor: where tiles run; must share this process's memory. None makes `settings.jobs` threads.
         session: has what earlier pictures needed, and keeps what this one does; the picture is the same without it.
         watch: who wants to see it before it is finished, and when to stop.
+        scene_at: reads the stage at another time code, for what moves while the camera's shutter is open; None draws
+            what the scene shows, as at one instant.
 
     Raises:
         UsageError: no such camera, or a camera without a field of view; or it is to be denoised, and that extra is
@@ -80,13 +85,18 @@ def render(
     """
     started = time.perf_counter()
     settings = settings or RenderSettings()
-    if not settings.camera_light:
-        scene = replace(scene, camera_light=False)
-    scene = settled(scene)
     if settings.denoise:
         check_installed()
-    camera = camera_of(scene, settings)
-    scene, around = dressed(scene, camera, settings)
+    time_code, camera = scene.time_code, camera_of(scene, settings)
+    moments: list[Moment] = []
+    if scene_at is not None and (moments := moments_of(camera, settings, time_code)):
+        # Samples of other instants are other pictures: corners of pixels would all be alike.
+        settings = replace(settings, tolerance=0.0, camera=camera.path)
+        session = session or Session()
+        if moments[0].time_code != time_code:
+            scene = replace(scene_at(moments[0].time_code), notices=scene.notices)
+    blurred = shutter_of_few(camera, settings, moments, readable=scene_at is not None)
+    scene, camera, around = _set_up(scene, settings)
     width, height = image_size(camera, settings.image_width, settings.image_height)
     window = window_of(settings, width, height)
     whole = window == (0, 0, width, height)
@@ -94,16 +104,40 @@ def render(
         if needs_compiling(_as_drawn(settings, camera)):
             work.progress(0.0, COMPILING)
         limited = work._replace(cancel=lambda: work.cancel() or (watch is not None and watch.is_over()))
+
+        def made(scene: Scene, camera: Camera, work: Work) -> Ready:
+            over = glass_over(scene, camera, settings, work)
+            return prepare(scene, camera, settings, work, over, session)
+
         with _time_up(work, watch):
-            over = glass_over(scene, camera, settings, limited)
-            ready = prepare(scene, camera, settings, limited, over, session)
+            ready = made(scene, camera, limited)
+        guides: list[Found] = []
+        other_rays: list[int] = []
+
+        def instants() -> Iterator[Instant]:
+            """The stage at one moment after the other, made ready; and what a denoiser reads, drawn of each."""
+            one = Instant(ready, scene, camera, ())
+            for number, moment in enumerate(moments):
+                if number and scene_at is not None:
+                    unheard = limited._replace(progress=lambda _share, _stage: None)
+                    then, eye, _ = _set_up(scene_at(moment.time_code), settings)
+                    one = Instant(made(then, eye, unheard), then, eye, ())
+                    other_rays.append(one.ready.rays)
+                yield one._replace(samples=moment.samples)
+                if settings.denoise or settings.features:
+                    first = moment.samples[:1]
+                    seen = features_of(*one[:3], settings, (width, height), limited, window, first)
+                    guides.append(seen)
+            if not moments:
+                yield one
+
         x0, y0, x1, y1 = window
         place = None if whole else Place(x0, y0, width, height)
         metadata: dict[str, str | float] = {
             "software": f"refract {__version__}",
             "refract:stage": _file_name(scene.name),
             "refract:camera": camera.path,
-            "refract:timeCode": scene.time_code,
+            "refract:timeCode": time_code,
             "refract:samples": float(settings.samples),
             "refract:tiers": ",".join(settings.tiers),
             "refract:screen": settings.screen,
@@ -117,22 +151,26 @@ def render(
 
         stopped: tuple[Notice, ...] = ()
         if watch is None:
-            planes, rays = _draw(ready, scene, camera, settings, (width, height), work, window)
+            planes, rays = _draw(instants(), scene, camera, settings, (width, height), work, window)
         else:
-            drawn = _watched(ready, scene, camera, settings, (width, height), work, window, watch, so_far)
+            drawn = _watched(instants, scene, camera, settings, (width, height), work, window, watch, so_far)
             planes, rays, finished, stopped = drawn
             if finished < 1.0:
                 metadata[FINISHED] = finished
         if settings.denoise or settings.features:
-            rays += _guide(planes, ready, scene, camera, settings, work, (width, height), window)
+            work.progress(1.0, "denoising" if settings.denoise else "image")
+            if not guides:
+                guides = [features_of(ready, scene, camera, settings, (width, height), work, window)]
+            rays += _guide(planes, guides, camera, settings)
         mattes, matte_rays = draw_mattes(ready, scene, camera, settings, (width, height), work, window)
         work.progress(1.0, "done")
-    metadata["refract:rays"] = float(rays + ready.rays + matte_rays)
+    metadata["refract:rays"] = float(rays + ready.rays + sum(other_rays) + matte_rays)
     if settings.denoise:
         metadata["refract:denoised"] = "Open Image Denoise"
     notices = scene.notices + around + camera_light(scene) + open_meshes(scene, settings.model)
     notices += glass_twice(scene, settings)
-    notices += ready.notices + lens_of_few(camera, settings) + out_of_range(camera, settings, planes) + stopped
+    notices += ready.notices + lens_of_few(camera, settings) + blurred
+    notices += out_of_range(camera, settings, planes) + stopped
     if whole:
         notices += nothing_seen(scene, camera, planes)
     seconds = time.perf_counter() - started
@@ -165,13 +203,27 @@ def camera_attributes(scene: Scene, camera: Camera, size: tuple[int, int]) -> di
     return {**{name: tuple(map(float, matrix.ravel())) for name, matrix in rows.items()}, "near": near, "far": far}
 
 
-def _guide(
-    planes: dict[str, F32], ready: Ready, scene: Scene, camera: Camera, settings: RenderSettings, work: Work,
-    size: tuple[int, int], window: Tile,
-) -> int:  # fmt: skip
-    """Draw what a denoiser reads, let it read that, and keep it where it is asked for. Returns rays traced."""
-    work.progress(1.0, "denoising" if settings.denoise else "image")
-    found = features_of(ready, scene, camera, settings, size, work, window)
+def _set_up(scene: Scene, settings: RenderSettings) -> tuple[Scene, Camera, tuple[Notice, ...]]:
+    """The scene with what the settings put around it, who takes the picture, and what is to be said of it."""
+    if not settings.camera_light:
+        scene = replace(scene, camera_light=False)
+    scene = settled(scene)
+    camera = camera_of(scene, settings)
+    scene, notices = dressed(scene, camera, settings)
+    return scene, camera, notices
+
+
+def _guide(planes: dict[str, F32], guides: Sequence[Found], camera: Camera, settings: RenderSettings) -> int:
+    """Let a denoiser read what was drawn for it, and keep that where it is asked for. Returns rays traced for it.
+
+    Args:
+        guides: of every instant.
+    """
+    found = guides[0]
+    if len(guides) > 1:
+        share = np.float32(1.0 / len(guides))
+        albedo, normal = (sum(plane * share for plane in planes) for planes in list(zip(*guides, strict=True))[:2])
+        found = Found(albedo, normal, sum(one.rays for one in guides))
     if settings.denoise:
         planes["beauty"] = without_noise(planes["beauty"], found, settings, camera)
     if settings.features:
@@ -258,23 +310,34 @@ def glass_twice(scene: Scene, settings: RenderSettings) -> tuple[Notice, ...]:
 
 
 def _draw(
-    ready: Ready, scene: Scene, camera: Camera, settings: RenderSettings, size: tuple[int, int], work: Work,
-    window: Tile | None = None,
+    instants: Iterable[Instant], scene: Scene, camera: Camera, settings: RenderSettings, size: tuple[int, int],
+    work: Work, window: Tile | None = None,
 ) -> tuple[dict[str, NDArray[np.float32]], int]:  # fmt: skip
     """All samples, averaged into planes. Returns the planes by AOV name, and rays traced.
 
     Args:
+        instants: what is drawn, one after the other; each has its samples, and none of several has all.
+        scene: whose data the planes keep, and `camera` with it.
         window: pixels of the picture that are wanted, whose planes are returned; None is all of it.
     """
     settings = _as_drawn(settings, camera)
     window = window or (0, 0, *size)
     planes = new_planes(*size)
     rays, done = 0, 0.2
-    for step in Tree(ready, scene, camera, settings, window, planes).passes():
+    for step in _passes(instants, settings, window, planes):
         share = 0.8 * step.share
         rays += sum(work.run(step.draw, step.items, _told(work, done, share)))
         done += share
     return _finished(scene, camera, settings, planes, window, work), rays
+
+
+def _passes(instants: Iterable[Instant], settings: RenderSettings, window: Tile, planes: Planes) -> Iterator[Pass]:
+    """What draws the samples of one instant after the other into the same sums."""
+    done = 0
+    for ready, scene, camera, samples in instants:
+        yield from Tree(ready, scene, camera, settings, window, planes, samples, done).passes()
+        done += len(samples)
+        del ready, scene  # gone before the next takes its place
 
 
 def _finished(
@@ -307,8 +370,8 @@ def _time_up(work: Work, watch: Watch | None) -> Iterator[None]:
 
 
 def _watched(
-    ready: Ready, scene: Scene, camera: Camera, settings: RenderSettings, size: tuple[int, int], work: Work,
-    window: Tile, watch: Watch, so_far: Callable[[dict[str, F32], float], Frame],
+    instants: Callable[[], Iterable[Instant]], scene: Scene, camera: Camera, settings: RenderSettings,
+    size: tuple[int, int], work: Work, window: Tile, watch: Watch, so_far: Callable[[dict[str, F32], float], Frame],
 ) -> tuple[dict[str, F32], int, float, tuple[Notice, ...]]:  # fmt: skip
     """As `_draw`, for somebody who wants to see it before it is finished: also what share of it is as asked, and a
     notice where that is not all."""
@@ -318,13 +381,13 @@ def _watched(
     if watch.deadline < math.inf and settings.by_corners:
         quiet = limited._replace(progress=lambda _share, _stage: None)
         with _time_up(work, watch):
-            first, rays = _draw(ready, scene, camera, replace(settings, samples=1), size, quiet, window)
+            first, rays = _draw(instants(), scene, camera, replace(settings, samples=1), size, quiet, window)
     exposure = camera.exposure_scale * 2.0**settings.exposure
     planes = new_planes(*size)
     drawn = Drawn(planes, _place(camera, settings, size), lambda samples: finish_of(scene, samples, exposure))
     tiles = 0
     try:
-        for step in Tree(ready, scene, camera, settings, window, planes).passes():
+        for step in _passes(instants(), settings, window, planes):
             share = 0.8 * step.share
             if step.samples:
                 tiles = len(step.items) + (tiles if settings.by_corners else 0)
@@ -402,7 +465,8 @@ def glass_over(
                 ready = prepare_bare(seen, camera, settings, quiet)
             side, rays = texels.shape[1], 0
             for face in range(len(texels)):
-                planes, traced = _draw(ready, seen, face_camera(probe, face), asked, (side, side), quiet)
+                eye = face_camera(probe, face)
+                planes, traced = _draw([Instant(ready, seen, eye, ())], seen, eye, asked, (side, side), quiet)
                 depth = planes["Z"] * scene.metres_per_unit
                 paste_face(texels[face], planes["mask"] > 0.0, planes["beauty"], depth, probe.background)
                 rays += traced

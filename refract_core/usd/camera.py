@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -169,12 +168,10 @@ def _positive(attribute: Usd.Attribute, time: Usd.TimeCode, default: float, noti
 
 def choose_camera(
     stage: Usd.Stage,
-    time: Usd.TimeCode,
     cameras: tuple[Camera, ...],
     wanted: str,
     bounds: Bounds,
     *,
-    moving: bool,
     orbits: bool,
     engine_from_stage: F64,
     metres_per_unit: float,
@@ -187,7 +184,6 @@ def choose_camera(
     with, and one made to frame everything.
 
     Args:
-        moving: something that is drawn varies in time
         orbits: the picture is taken by a camera of its own, so nothing is said of one that nobody asked for
 
     Raises:
@@ -205,26 +201,7 @@ def choose_camera(
         camera, where = see_everything(bounds)
         notices.append(Notice("/", f"the stage has no camera; one that frames everything from {where} is used"))
         return (camera,)
-    notices.extend(_frozen(UsdGeom.Camera(stage.GetPrimAtPath(chosen.path)), time, moving))
     return (chosen, *(camera for camera in cameras if camera is not chosen))
-
-
-def _frozen(camera: UsdGeom.Camera, time: Usd.TimeCode, moving: bool) -> Iterator[Notice]:
-    """Says that a shutter stays open while things move, which is not drawn."""
-    opens, closes = (attribute.Get(time) for attribute in (camera.GetShutterOpenAttr(), camera.GetShutterCloseAttr()))
-    if opens == closes or not (moving or _moves(camera.GetPrim())) or _switched_off(camera, "disableMotionBlur"):
-        return
-    text = f"its shutter is open from {opens:g} to {closes:g} while things move, but motion blur is not drawn: "
-    yield Notice(str(camera.GetPath()), text + "everything stands still at the time of the frame")
-
-
-def _moves(prim: Usd.Prim) -> bool:
-    while prim:
-        xformable = UsdGeom.Xformable(prim)
-        if xformable and xformable.TransformMightBeTimeVarying():
-            return True
-        prim = prim.GetParent()
-    return False
 
 
 def _saved_with(stage: Usd.Stage) -> dict[str, Any]:

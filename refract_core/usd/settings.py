@@ -20,6 +20,8 @@ _IGNORED = (
     "pixelAspectRatio",
     "renderingColorSpace",
 )
+_STILL = ("disableMotionBlur", "instantaneousShutter")
+"""The older of the two is the second."""
 
 
 def read_settings(
@@ -57,7 +59,8 @@ def read_settings(
 
 
 def frame_of(prim: Usd.Prim) -> dict[str, object]:
-    """Camera and resolution that a RenderSettings or RenderProduct prim authors, as fields of `RenderSettings`.
+    """What a RenderSettings or RenderProduct prim authors of camera, resolution and motion blur, as fields of
+    `RenderSettings`.
 
     Raises:
         StageError: a resolution that no picture can have.
@@ -72,6 +75,9 @@ def frame_of(prim: Usd.Prim) -> dict[str, object]:
         found["image_width"], found["image_height"] = (int(length) for length in size)
         if min(size) < 1:
             raise StageError(f"{prim.GetPath()}: resolution is {size}; both numbers must be 1 or more")
+    stills = [authored_value(prim, name) for name in _STILL]
+    if any(still is not None for still in stills):
+        found["motion_blur"] = not any(stills)
     return found
 
 

@@ -39,6 +39,7 @@ from .preview import preview_stage
 from .probes.pictures import read_cubemap
 from .probes.read import read_probes
 from .registering import register
+from .shutter import with_shutters
 from .values import triple
 
 Keep = Callable[[list[Placement], Tables], list[Placement]]
@@ -170,11 +171,14 @@ def scene_from_stage(
         raise UsageError(f"complexity is '{complexity}', not known; choose from {', '.join(FINENESS)}")
     time = Usd.TimeCode(time_range(stage)[0] if time_code is None else time_code)
     notices = _composition_notices(stage)
+    authored = stage
     with captured():  # composing again repeats the same warnings
         stage = recognised(posed(stage, time, notices))
     with captured() as heard:
         try:
             scene = _read(stage, time, purposes, camera, complexity, notices, keep, orbits)
+            # What is posed stands still.
+            scene = replace(scene, cameras=with_shutters(authored, time, scene.cameras, notices))
         except Tf.ErrorException as error:
             reason = words_of(error.args[0])
             raise StageError(f"{stage.GetRootLayer().identifier}: USD cannot read it: {reason}") from error
@@ -261,9 +265,8 @@ def _read(
     }
     every_mesh = (*meshes, *(many.mesh for many in instances))
     every_ball: tuple[Sphere | Balls, ...] = (*spheres, *balls)
-    moving = not (all(mesh.static for mesh in every_mesh) and all(ball.static for ball in every_ball))
     every_camera = read_cameras(stage, time, **frame)
-    cameras = choose_camera(stage, time, every_camera, camera, bounds, moving=moving, orbits=orbits, **frame)
+    cameras = choose_camera(stage, every_camera, camera, bounds, orbits=orbits, **frame)
     things = [prim_of(mesh.path) for mesh in meshes] + [prim_of(ball.path) for ball in spheres]
     every_path = [many.paths for many in instances] + [cloud.paths for cloud in balls]
     things += [owner for some in every_path for owner, _ in some.owners()]

@@ -116,13 +116,15 @@ def compare_stage(order: CompareOrder, report: Report, cancel: Callable[[], bool
     settings = chosen_settings({**bare, **read_settings(stage, order.settings_prim, notices)}, order.overrides)
     if order.suggest and settings.model:
         raise UsageError(f"the stage's RenderSettings choose the model '{settings.model}'; --suggest needs none")
-    reader = partial(scene_from_stage, time_code=order.time_code, purposes=settings.purposes, camera=settings.camera)
+    if order.suggest:  # its trials have numbers that the stage does not have at other times
+        settings = replace(settings, motion_blur=False)
+    reader = partial(scene_from_stage, purposes=settings.purposes, camera=settings.camera)
 
-    def read(stage: Any) -> Scene:
-        return apart(reader(stage), _MOST_APART)
+    def read(stage: Any, time_code: float | None = order.time_code) -> Scene:
+        return apart(reader(stage, time_code=time_code), _MOST_APART)
 
     scene = read(stage)
-    drawn = _draw(order, scene, settings, report, cancel)
+    drawn = _draw(order, scene, settings, report, cancel, partial(read, stage))
     notices += [*drawn.frame.notices, *_only_of_reference(drawn)]
     findings = find(drawn.contrast, drawn.frame.planes, _objects(drawn))
     suggestion: Suggestion | None = None
@@ -141,8 +143,9 @@ def compare_stage(order: CompareOrder, report: Report, cancel: Callable[[], bool
 
 
 def _draw(
-    order: CompareOrder, scene: Scene, settings: RenderSettings, report: Report, cancel: Callable[[], bool]
-) -> Drawn:
+    order: CompareOrder, scene: Scene, settings: RenderSettings, report: Report, cancel: Callable[[], bool],
+    scene_at: Callable[[float], Scene],
+) -> Drawn:  # fmt: skip
     """The picture, its reference, and whose pixel is whose."""
     from ..rendering.picture import render
     from ..rendering.session import Session
@@ -152,7 +155,7 @@ def _draw(
     def draw(other: Scene, how: RenderSettings, what: str) -> Frame:
         stop_if(cancel, STATE)
         told = lambda share, stage: report.progress(share, f"{what}: {stage}")  # noqa: E731
-        return render(other, how, progress=told, cancel=cancel, session=session)
+        return render(other, how, progress=told, cancel=cancel, session=session, scene_at=scene_at)
 
     frame = draw(scene, settings, "picture")
     reference = draw(scene, reference_settings(settings, order.reference_samples), "reference")

@@ -420,7 +420,13 @@ def _draw(
         tell(_stale(changed, scene, shot))
     stop_if(cancel, _STATE)
     eyes: dict[str, Any] = {"watch": watch()} if watch else {}
-    frame = render(scene, settings, progress=progress, cancel=cancel, session=session, **eyes)
+
+    def scene_at(time_code: float) -> Scene:
+        return changed(**{**_how(shot), "time_code": time_code})
+
+    frame = render(
+        scene, settings, progress=progress, cancel=cancel, session=session, scene_at=scene_at, **eyes
+    )
     tell(frame.notices)
     return replace(frame, metadata={**frame.metadata, **override_notes(shot.materials)})
 
