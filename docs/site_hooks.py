@@ -1,13 +1,12 @@
 """What mkdocs.yml needs beyond the pages: links lead to the same places in the repository and on the site.
 
-The pages link to each other, and to README, samples and sources beside this folder, as the repository has them. Here
-README becomes the first page, files beside this folder that are linked become files of the site, a folder that is linked
-becomes a list of what is in it, and the public names of `refract_core` a reference.
+The pages link to each other, and to README, samples and sources beside this folder, as the repository has them.
+Here README becomes the first page, files beside this folder that are linked become files of the site, a folder that is
+linked becomes a list of what is in it, and the public names of `refract_core` a reference.
 """
 
 from __future__ import annotations
 
-import os
 import posixpath
 import re
 from pathlib import Path
@@ -97,8 +96,9 @@ def listing(place: str) -> str:
 
 def reference() -> str:
     """A section for each public name, where it is defined."""
-    head = "# Python reference\n\n`import refract_core as rc`; these are its names. [From Python](python.md) shows them at work.\n"
+    head = "# Python reference\n\nWhat `import refract_core as rc` has; [From Python](python.md) shows it at work.\n"
+    options = "    options:\n      heading_level: 2\n"
     names = sorted(refract_core._ROOMS, key=lambda name: (name[0].isupper(), name))
     return head + "".join(
-        f"\n::: refract_core.{refract_core._ROOMS[name]}.{name}\n    options:\n      heading_level: 2\n" for name in names
+        f"\n::: {refract_core.__name__}.{refract_core._ROOMS[name]}.{name}\n{options}" for name in names
     )
