@@ -12,8 +12,9 @@ _ROW = re.compile(r"^\| !\[([^\]]+)\]\(([^)]+)\) \| (.+)<br>`(refract [^`]+)` \|
 _HEAD = """# Gallery
 
 Every sample with its picture, what to look at, its stage and its command. This page is made from
-[the table of the samples](../usd_samples/README.md) by `python docs/make_gallery_page.py`. `refract samples NAME --to .`
-copies a stage with all that it needs; the pictures here are larger and have more samples, as that table says.
+[the table of the samples](../usd_samples/README.md) by `python docs/make_gallery_page.py`.
+`refract samples NAME --to .` copies a stage with all that it needs; the pictures here are larger and have more samples,
+as that table says.
 """
 
 

@@ -97,7 +97,8 @@ class Frame:
         bar that says what they mean. What only glass has, such as a thickness, is grey where there is none.
 
         Args:
-            low, high: what the ends of the bar mean; None is the least and the most in the picture.
+            low: what the lower end of the bar means; None is the least in the picture.
+            high: the same of the upper end, and of the most.
 
         Raises:
             UsageError: the frame has no such plane, or the ends are no range.
