@@ -39,8 +39,8 @@ def test_it_renders_without_a_warning_and_glass_is_in_the_picture(stage: Path) -
     frame = small(stage)
     if stage.stem == ALONE:
         assert len(frame.notices) == 2
-        assert "no camera" in frame.notices[0]
-        assert "no light" in frame.notices[1]
+        assert "no camera" in frame.notices[0].text
+        assert "no light" in frame.notices[1].text
     else:
         assert frame.notices == ()
     for name, plane in frame.planes.items():
