@@ -125,7 +125,7 @@ def test_every_sample_is_drawn_in_a_worker_as_it_is_without(tmp_path: Path) -> N
                 answer = client.post("/v1/render", json={"stage": path.name, **settings})
                 job = client.get(answer.headers["content-location"]).json()
             assert answer.status_code == 200, (path.name, answer.text)
-            assert job["warnings"] == [], path.name
+            assert len(job["warnings"]) == (2 if path.stem == "bottle" else 0), path.name  # it has no camera, no light
             (tmp_path / "theirs.png").write_bytes(answer.content)
             frame = render(load_stage(path), RenderSettings(image_width=48, samples=1))
             frame.save(str(tmp_path / "ours.png"))

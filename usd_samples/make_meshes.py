@@ -11,6 +11,58 @@ from scipy.spatial import ConvexHull
 
 F64 = NDArray[np.float64]
 FOLDER = Path(__file__).parent / "good" / "parts"
+# Corners of what is turned on a lathe: radius and height in centimetres. They are a cage: the surface is the limit of
+# its subdivision, so two corners close together are a sharp edge. A body that begins and ends on the axis is closed.
+LATHED: dict[str, tuple[str, list[tuple[float, float]]]] = {
+    "bottle": (
+        "The glass of a bottle, 24 cm tall: outside and inside are one closed surface.",
+        [(0, 0.5), (2.2, 0.5), (2.9, 0), (3.55, 0), (3.7, 0.15), (3.7, 1), (3.7, 7), (3.7, 13), (3.7, 14.6), (3.3, 16),
+         (1.7, 17.2), (1.35, 18.4), (1.3, 20.5), (1.3, 22.2), (1.7, 22.3), (1.75, 22.6), (1.75, 23.7), (1.6, 24),
+         (1.15, 24), (0.95, 23.8), (0.95, 22), (0.95, 18.4), (1.3, 16.8), (2.9, 15.7), (3.35, 14.4), (3.35, 13),
+         (3.35, 7), (3.35, 1.6), (3.2, 1.1), (2.2, 1.3), (0, 1.3)],
+    ),
+    "oil": (
+        "What is in the bottle: it reaches into the glass, which has the higher priority.",
+        [(0, 0.9), (2.3, 0.9), (3.3, 0.7), (3.5, 1), (3.5, 2), (3.5, 7), (3.5, 12.2), (3.5, 12.9), (3.5, 13), (3.3, 13),
+         (2.5, 13), (0, 13)],
+    ),
+    "cork": (
+        "A cork for the bottle.",
+        [(0, 21.2), (0.8, 21.2), (0.94, 21.3), (0.94, 22), (0.94, 23.6), (1.1, 24.9), (1.1, 25.1), (0.95, 25.3),
+         (0, 25.3)],
+    ),
+    "tumbler": (
+        "A drinking glass, 12 cm tall, with a heavy foot.",
+        [(0, 0.15), (2.3, 0.15), (2.6, 0), (2.9, 0), (3, 0.1), (3.02, 0.5), (3.2, 3), (3.5, 7), (3.78, 11.7),
+         (3.8, 11.95), (3.7, 12.05), (3.6, 11.95), (3.57, 11.7), (3.28, 7), (2.98, 3), (2.9, 1.9), (2.7, 1.45),
+         (1.8, 1.3), (0, 1.3)],
+    ),
+    "drink": (
+        "What is in the tumbler: it reaches into the glass, which has the higher priority.",
+        [(0, 0.9), (1.9, 0.9), (2.8, 1), (2.97, 1.6), (3.08, 3), (3.38, 7), (3.58, 9.6), (3.6, 9.95), (3.59, 10),
+         (3.4, 10), (2, 10), (0, 10)],
+    ),
+    "lantern": (
+        "A glass for a candle, 17 cm tall, open above: a closed surface with a thick bottom.",
+        [(0, 0.1), (3.4, 0.1), (3.8, 0), (4.3, 0), (4.5, 0.2), (4.6, 0.8), (5.4, 4), (5.5, 8), (4.6, 12), (4.3, 14),
+         (4.6, 16.8), (4.62, 17), (4.5, 17.05), (4.4, 16.9), (4.08, 14), (4.38, 12), (5.27, 8), (5.17, 4),
+         (4.35, 1.6), (4.1, 1.3), (3.4, 1.2), (0, 1.2)],
+    ),
+    "candle": (
+        "A candle with a hollow where the wax has melted.",
+        [(0, 1.21), (2.2, 1.21), (2.4, 1.22), (2.5, 1.4), (2.5, 4), (2.5, 7.2), (2.45, 7.7), (2.3, 7.8), (2.0, 7.6),
+         (1.4, 7.3), (0, 7.2)],
+    ),
+    "flame": (
+        "A flame, 2.6 cm tall.",
+        [(0, 7.75), (0.2, 7.8), (0.42, 8.3), (0.44, 8.8), (0.3, 9.5), (0.1, 10.3), (0, 10.6)],
+    ),
+    "lens": (
+        "A lens with two sides alike, 9 cm wide and 2 cm thick, lying on its lower side.",
+        [(0, 0), (1.2, 0.06), (2.4, 0.27), (3.5, 0.58), (4.35, 0.88), (4.45, 0.92), (4.5, 0.96), (4.5, 1.04),
+         (4.45, 1.08), (4.35, 1.12), (3.5, 1.42), (2.4, 1.73), (1.2, 1.94), (0, 2)],
+    ),
+}  # fmt: skip
 
 
 def main() -> None:
@@ -18,6 +70,30 @@ def main() -> None:
     _write("gem", "A brilliant cut, 1.24 m wide.", *gem())
     _write("ring", "A torus around y, 1.18 m wide.", *ring())
     _write("vase", "An open surface of revolution, 1.05 m tall.", *vase())
+    for name, (doc, profile) in LATHED.items():
+        _write(name, doc, *lathe(profile), None, unit=0.01, scheme="catmullClark")
+    points, faces, colors = rose()
+    tint = f"    color3f[] primvars:refraction:transmittanceColor = [{_text(colors)}] (\n"
+    tint += '        interpolation = "uniform"\n    )'
+    _write("rose", "The panes of a round window, 2 m wide, each with a colour.", points, faces, None, more=[tint])
+
+
+def rose(sectors: int = 12, pieces: int = 4) -> tuple[F64, list[list[int]], F64]:
+    """Panes in three rings in the plane z = 0, with the colour that is left of white after each."""
+    palette = np.array(
+        [(0.85, 0.05, 0.04), (0.04, 0.14, 0.75), (0.95, 0.6, 0.05), (0.05, 0.45, 0.16), (0.4, 0.06, 0.5)]
+    )
+    points, faces, colors = [], [], []
+    rings = ((0.12, 0.34, 0.0, (2, 0)), (0.34, 0.68, 0.5, (1, 4)), (0.68, 1.0, 0.0, (0, 3, 1)), (0.0, 0.12, 0.0, (2,)))
+    for inner, outer, turn, order in rings:
+        for sector in range(sectors):
+            angle = 2.0 * np.pi * (sector + turn + np.arange(pieces + 1) / pieces) / sectors
+            arc = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=-1)
+            pane = np.vstack([outer * arc, inner * arc[::-1] if inner else [[0.0, 0.0, 0.0]]])
+            faces.append([len(points) + i for i in range(len(pane))])
+            points.extend(pane)
+            colors.append(palette[order[sector % len(order)]])
+    return np.array(points), faces, np.array(colors)
 
 
 def gem(size: float = 0.62) -> tuple[F64, list[list[int]], None]:
@@ -72,6 +148,21 @@ def vase(around: int = 32, rows: int = 14) -> tuple[F64, list[list[int]], F64]:
     return points, faces.tolist(), normals
 
 
+def lathe(profile: Sequence[tuple[float, float]], around: int = 16) -> tuple[F64, list[list[int]]]:
+    """The cage of a closed body of revolution around y, whose limit has the radii that are given."""
+    widen = 3.0 / (2.0 + np.cos(2.0 * np.pi / around))  # a cubic spline runs inside of its polygon
+    radius, height = np.array(profile, dtype=np.float64).T
+    rings = [_circle(around, widen * r, y) for r, y in zip(radius[1:-1], height[1:-1], strict=True)]
+    points = np.vstack([*rings, [[0.0, height[0], 0.0], [0.0, height[-1], 0.0]]])
+    number = np.arange(len(rings) * around).reshape(-1, around)
+    beside = np.roll(number, -1, axis=1)
+    faces = np.stack([number[:-1], number[1:], beside[1:], beside[:-1]], axis=-1).reshape(-1, 4).tolist()
+    first, last = len(points) - 2, len(points) - 1
+    faces += [[first, here, there] for here, there in zip(number[0], beside[0], strict=True)]
+    faces += [[last, there, here] for here, there in zip(number[-1], beside[-1], strict=True)]
+    return points, [[int(index) for index in face] for face in faces]
+
+
 def _circle(count: int, radius: float, height: float, turn: float = 0.0) -> F64:
     """Points around the y axis, the first turned by that many steps."""
     angle = 2.0 * np.pi * (np.arange(count) + turn) / count
@@ -89,12 +180,22 @@ def _text(rows: F64 | list[F64]) -> str:
     return ", ".join("(" + ", ".join(f"{value + 0.0:.4g}" for value in row) + ")" for row in np.round(rows, 6))
 
 
-def _write(name: str, doc: str, points: F64, faces: Sequence[Sequence[int]], normals: F64 | None) -> None:
+def _write(
+    name: str,
+    doc: str,
+    points: F64,
+    faces: Sequence[Sequence[int]],
+    normals: F64 | None,
+    *,
+    unit: float = 1,
+    scheme: str = "none",
+    more: Sequence[str] = (),
+) -> None:
     title = name.capitalize()
     lines = [
         f'#usda 1.0\n(\n    defaultPrim = "{title}"\n    doc = "{doc} Written by make_meshes.py."',
-        f'    metersPerUnit = 1\n    upAxis = "Y"\n)\n\ndef Mesh "{title}"\n{{',
-        '    uniform token subdivisionScheme = "none"',
+        f'    metersPerUnit = {unit:g}\n    upAxis = "Y"\n)\n\ndef Mesh "{title}"\n{{',
+        f'    uniform token subdivisionScheme = "{scheme}"',
         f"    int[] faceVertexCounts = {[len(face) for face in faces]}",
         f"    int[] faceVertexIndices = {[index for face in faces for index in face]}",
         f"    point3f[] points = [{_text(points)}]",
@@ -102,7 +203,7 @@ def _write(name: str, doc: str, points: F64, faces: Sequence[Sequence[int]], nor
     ]
     if normals is not None:
         lines.append(f'    normal3f[] normals = [{_text(normals)}] (\n        interpolation = "vertex"\n    )')
-    (FOLDER / f"{name}.usda").write_text("\n".join([*lines, "}"]) + "\n", encoding="utf-8")
+    (FOLDER / f"{name}.usda").write_text("\n".join([*lines, *more, "}"]) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

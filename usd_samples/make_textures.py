@@ -20,6 +20,7 @@ def main() -> None:
     _write("room.png", _encoded(room()))
     _write("stripes.png", _encoded(stripes()))
     _write("ripples.png", ripples()[..., None])
+    _write("newspaper.png", newspaper()[..., None])
     _write("studio.exr", studio())
 
 
@@ -77,6 +78,35 @@ def ripples(size: int = 256) -> F64:
     wave = 0.5 - 0.5 * np.cos(2.0 * np.pi * 4.0 * radius)
     fade = np.clip(1.15 - radius, 0.0, 1.0)
     return np.clip(0.08 + 0.92 * wave * fade, 0.0, 1.0)
+
+
+def newspaper(width: int = 1200) -> F64:
+    """sRGB values 0 .. 1 of a front page: title, headline and four columns, in OpenImageIO's own letters."""
+    height = width * 2 // 3
+    page = oiio.ImageBuf(oiio.ImageSpec(width, height, 1, "float"))
+    oiio.ImageBufAlgo.fill(page, (0.86,))
+    ink = (0.07,)
+    for title, y, size in (("THE DAILY LENS", 100, 92), ("Light bends on its way through glass", 190, 54)):
+        oiio.ImageBufAlgo.render_text(page, width // 2, y, title, size, "", ink, "center", "baseline")
+    for y in (118, 124, 214):
+        oiio.ImageBufAlgo.render_box(page, 40, y, width - 40, y + 1, ink, True)
+    text = (
+        "A ray that enters glass is slower there and so it turns towards the normal said Snell in Leiden. How much it "
+        "turns the index tells. Where it leaves the glass it turns back unless it comes too flat in which case all of "
+        "it is mirrored and stays within. Two round faces make a lens that gathers the light of a window in one spot "
+        "and shows small letters large to whoever looks through it from above. Red turns less than blue. "
+    )
+    story = text.split()
+    at = 0
+    for column in range(4):
+        for line in range(20):
+            words: list[str] = []
+            while len(" ".join([*words, story[at % len(story)]])) < 27:
+                words.append(story[at % len(story)])
+                at += 1
+            x, y = 40 + column * 285, 252 + line * 27
+            oiio.ImageBufAlgo.render_text(page, x, y, " ".join(words), 20, "", ink)
+    return np.asarray(page.get_pixels(oiio.FLOAT), dtype=np.float64)[..., 0]
 
 
 def studio(width: int = 256) -> F64:
