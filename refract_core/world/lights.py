@@ -33,7 +33,7 @@ _SMALLEST_POINT_LOBE = 0.02
 """GGX width [alpha] below which a light without size is not sharpened: it would be an infinitely bright dot."""
 _BEYOND = 1e30
 """[m] how far away distant lights are."""
-_LEAST = 1e-12
+_LEAST = 1e-30
 """Weight of a point of a light that brings nothing: alone, it still says whether the light is hidden."""
 _NEAREST2 = 1e-12
 """[m^2] squared distance that a light counts as having at least, so that nothing is divided by 0."""
