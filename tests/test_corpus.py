@@ -35,7 +35,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict[str,
     shutil.copy(SAMPLES / "bad" / "not_usd.usda", folder / "damaged.usda")
     (folder / "empty.usda").write_text("#usda 1.0\n")
     (folder / "notes.txt").write_text("no stage")
-    return out, corpus.run(folder, out, width=24, seconds=300.0, jobs=1, keep=False)
+    return out, corpus.run(folder, out, width=24, seconds=1800.0, jobs=1, keep=False)
 
 
 def test_every_stage_is_a_row_whatever_becomes_of_it(made: tuple[Path, list[dict[str, object]]]) -> None:
