@@ -25,6 +25,9 @@ def with_shutters(
     known: dict[tuple[float, float], bool] = {CLOSED: False}
     found = []
     for camera in cameras:
+        if not camera.path:  # it is none of the stage's
+            found.append(camera)
+            continue
         shutter = _shutter(UsdGeom.Camera(stage.GetPrimAtPath(camera.path)), time, notices)
         if shutter not in known:
             known[shutter] = moves(stage, *(time.GetValue() + at for at in shutter))
