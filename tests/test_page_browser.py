@@ -117,7 +117,7 @@ def shows(canvas: Any, colour: list[int]) -> bool:
 def test_the_first_screen_is_pictures_of_the_stages(page: Any, service: FakeService) -> None:
     """One that lies beside a stage is shown as it is, another is drawn; parts of stages are names alone."""
     cards = page.locator("#gallery canvas")
-    assert cards.count() == 2
+    until(page, lambda: cards.count() == 2)
     for place, colour in enumerate(([200, 80, 40, 255], [40, 80, 200, 255])):
         until(page, partial(shows, cards.nth(place), colour))
     assert service.asked("GET", "/v1/thumbnails/ball.usda") == []

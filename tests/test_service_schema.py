@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import random
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import cycle
 from typing import Any
 
 import pytest
@@ -75,15 +76,16 @@ def jobs(server: Server) -> list[str]:
 
 @pytest.fixture
 def prepared(jobs: list[str]) -> Iterator[None]:
-    """Requests that are right name a stage, or a job, that is there; headers change from one to the next."""
+    """Requests that are right name a stage, or a job, that is there; headers go round, for each operation by itself."""
     dice = random.Random(1)
+    rounds: defaultdict[str, Iterator[dict[str, str]]] = defaultdict(lambda: cycle(HEADERS))
 
     def before_call(context: Any, case: Any, kwargs: Any) -> None:
         if not case.meta or case.meta.generation.mode.value != "positive":
             return
         if any(part.mode.value != "positive" for part in case.meta.components.values()):
             return
-        case.headers = {**(case.headers or {}), **dice.choice(HEADERS)}
+        case.headers = {**(case.headers or {}), **next(rounds[case.operation.label])}
         of_a_job = "identifier" in case.path_parameters and not case.operation.path.startswith("/v1/live")
         if of_a_job and dice.random() < 0.75:
             case.path_parameters["identifier"] = dice.choice(jobs)
