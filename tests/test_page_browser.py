@@ -17,6 +17,8 @@ from typing import Any
 import pytest
 from fake_service import FakeService
 
+from refract_core.images.pictures import read_texture
+
 playwright = pytest.importorskip("playwright.sync_api")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 if CHROMIUM is None:
@@ -26,6 +28,7 @@ pytestmark = pytest.mark.slow
 PATIENCE = 60_000
 """[ms] Longest wait for what has to happen, on a machine whose cores are busy with other things."""
 playwright.expect.set_options(timeout=PATIENCE)
+ANGLES = ("azimuth", "elevation")
 NEVER = 3600.0
 """[s] A render that takes as long shows 0 % of progress in every test."""
 DONE, BOTH_DONE = "Done in 1.9 s.", "A done in 1.9 s; B done in 1.9 s."
@@ -509,6 +512,44 @@ def test_against_the_real_service(browser: Any, real_url: str) -> None:
     playwright.expect(opened.locator("#legend")).to_contain_text("1.24 m")
     opened.get_by_label("Samples per pixel").fill("4096")
     playwright.expect(opened.get_by_role("alert")).to_contain_text("limit")
+    opened.close()
+
+
+PIXELS = """node => [node.width, node.height,
+    ...node.getContext('2d').getImageData(0, 0, node.width, node.height).data]"""
+
+
+def test_a_turned_picture_is_the_render_of_the_camera_that_the_page_shows(browser: Any, real_url: str) -> None:
+    """From the pixels of a drag to those of the picture: 50 to the right and 25 down are 20 degrees to the left and
+    10 up, for what is near follows the hand."""
+    opened = browser.new_page()
+    opened.set_default_timeout(PATIENCE)
+    asked: list[Any] = []
+    opened.on("request", lambda one: asked.append(one.post_data_json) if one.url.endswith("/v1/render") else None)
+    opened.goto(f'{real_url}#stage=marble.usda&a={{"image_width":64,"samples":1}}')
+    took = re.compile(r"^Done in [\d.]+ s\.$")
+    playwright.expect(opened.locator("#status")).to_have_text(took, timeout=900_000)  # kernels may have to be compiled
+    start = {name: float(opened.locator(f"#set-{name}").get_attribute("placeholder")) for name in ANGLES}
+    drag(opened, 50, 25)
+    until(opened, lambda: "azimuth" in asked[-1] and "aovs" in asked[-1])
+    playwright.expect(opened.locator("#status")).to_have_text(took)
+    shown = {name: float(opened.locator(f"#set-{name}").input_value()) for name in (*ANGLES, "distance")}
+    turn = [shown[name] - start[name] for name in ANGLES]
+    assert turn == pytest.approx([-20.0, 10.0], abs=0.01)
+    wish = {"stage": "marble.usda", "image_width": 64, "samples": 1, "camera": "/World/Camera", **shown}
+
+    def rendered(**other: float) -> tuple[int, int, bytes]:
+        body = {**wish, "look_at": asked[-1]["look_at"], **other}
+        answer = opened.request.post(f"{real_url}v1/render", data=body, headers={"Accept": "image/png"})
+        assert answer.status == 200, answer.text()
+        picture = read_texture(answer.body(), name="picture", color_space="raw").pixels
+        high, wide = picture.shape[:2]
+        return wide, high, picture[..., :3].tobytes()
+
+    wide, high, *values = opened.locator("#canvas-a").evaluate(PIXELS)
+    colours = bytes(value for place, value in enumerate(values) if place % 4 < 3)
+    assert (wide, high, colours) == rendered()
+    assert colours != rendered(azimuth=-shown["azimuth"])[2]
     opened.close()
 
 
