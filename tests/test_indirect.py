@@ -146,6 +146,21 @@ def test_rooms_are_lit_as_by_quadrature(seed: int) -> None:
     assert np.abs(ratio.mean() - 1) < 0.025
 
 
+def test_an_edge_between_walls_has_no_teeth() -> None:
+    """Along the foot of a wall that is lit from below light changes as a slow curve does. Places there see something
+    that is nearer than they may speak for, so what they say is not what is beside them: one alone was a dark tooth."""
+    white = material("/white", DIFFUSE=0.8, IOR=1.0)
+    floor = quad("/floor", [(-3, 0, 3), (3, 0, 3), (3, 0, -1), (-3, 0, -1)], 0)
+    wall = quad("/wall", [(-3, 0, -1), (3, 0, -1), (3, 3, -1), (-3, 3, -1)], 0)
+    lamp = light(LightKind.RECT, (0, 0.02, 0.6), (0, 1, 0), (0.4, 0.4), 5.0)
+    lens = camera((0.1, 1.3, 1.0), (0.13, 0, -0.9), 0.2)
+    what = scene([floor, wall], [white], lights=(lamp,), cameras=(lens,))
+    beside = (picture(what, 96, indirect="one") - picture(what, 96, indirect="off"))[43:46, :, 0]  # the edge: above 42
+    for row in beside:
+        x = np.linspace(-1, 1, 96)
+        assert np.std(row / np.polyval(np.polyfit(x, row, 3), x)) < 0.09
+
+
 def test_light_goes_round_more_than_once() -> None:
     """`full` is brighter than `one`, by less than the walls that send back most would make it, everywhere."""
     room = Room(3)

@@ -153,7 +153,7 @@ def _sent_on(world: World, places: Places, bounds: tuple[F64, F64], work: Work) 
     for _ in range(_ROUNDS - 1):
         again = Places(*(column.copy() for column in places))
         _gather(by_address(world._replace(bounced=bounced_of(light[-1]))), again, bounds, work)
-        light.append(again._replace(reach=places.reach))
+        light.append(again._replace(reach=places.reach, trust=places.trust))
         sums.append(again.irradiance.sum(axis=0))
     added, before = sums[-1] - sums[-2], sums[-2] - sums[-3]
     ratio = np.clip(np.divide(added, before, out=np.zeros(3), where=before > 0.0), 0.0, 0.98)

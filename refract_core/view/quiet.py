@@ -454,7 +454,7 @@ def _look_into_mirrors(scratch: QuietScratch, world: World, care: Care, x0: int,
                 if scratch.part[i] < 0:
                     continue
                 copy_lane(block, lane, places, i)
-                block.lobes[lane] = max(1, care.rays // LOBES)
+                block.rays[lane], block.lobes[lane] = care.rays, max(1, care.rays // LOBES)
                 set_key(block.key, lane, _net_key(x, y))
             look_into_mirrors(block, looking.second, looking.packet, world, OPAQUE)
             for lane in range(LANES):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..kernels.arrays import F64_1D, F64_2D, F64_3D, I32_1D, I64_1D
 from ..kernels.compile import inlined, kernel
 from ..kernels.lanes import by_address
-from ..kernels.vec import Vec, add, cross, dot, row, sub
+from ..kernels.vec import Vec, add, along, cross, dot, row, scale, sub
 from .hashing import EMPTY, claim, slot_of
 
 _TURN = math.sqrt(1.0 - math.cos(math.radians(25.0)))
@@ -39,6 +39,8 @@ class Places(NamedTuple):
     """shape (R, 3): unit geometric normal, on the side that is lit"""
     reach: F64_1D
     """shape (R,): how far it speaks for others [m]"""
+    trust: F64_1D
+    """shape (R,): what its word counts beside others', above 0 .. 1; less where it speaks for more than it knows"""
     irradiance: F64_2D
     """shape (R, 3) [radiance * sr]"""
     turn: F64_3D
@@ -64,8 +66,8 @@ class Bounced(NamedTuple):
 
 def no_places(count: int = 0) -> Places:
     """Dark ones."""
-    rows = (np.zeros((count, 3)), np.zeros((count, 3)))
-    return Places(*rows, np.zeros(count), np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 3, 3)))
+    rows = (np.zeros((count, 3)), np.zeros((count, 3)), np.zeros(count), np.ones(count), np.zeros((count, 3)))
+    return Places(*rows, np.zeros((count, 3, 3)), np.zeros((count, 3, 3)))
 
 
 def no_bounced() -> Bounced:
@@ -133,21 +135,20 @@ def bounced_light(table: Bounced, p: Vec, ng: Vec, ns: Vec) -> tuple[Vec, float]
         p: place on a surface [m].
         ng, ns: its unit geometric and shading normal, on the side that is seen.
     """
-    light, total = (0.0, 0.0, 0.0), 0.0
+    light, weights, total = (0.0, 0.0, 0.0), 0.0, 0.0
     for level in range(table.cell.shape[0]):
         slot = slot_of(table.keys, _key(level, p, table.cell[level]))
         if table.keys[slot] == EMPTY:
             continue
         for k in range(table.first[slot], table.first[slot] + table.many[slot]):
             i = table.member[k]
-            weight = _word_of(table.places, i, p, ng)
-            if weight > 0.0:
-                said = _seen_from(table.places, i, p, ns)
-                light = (light[0] + weight * said[0], light[1] + weight * said[1], light[2] + weight * said[2])
-                total += weight
-    if total <= 0.0:
-        return light, 0.0
-    return (light[0] / total, light[1] / total, light[2] / total), total
+            word = _word_of(table.places, i, p, ng)
+            if word > 0.0:
+                weight = word * table.places.trust[i]
+                light = along(light, _seen_from(table.places, i, p, ns), weight)
+                weights += weight
+                total += word
+    return (scale(light, 1.0 / weights) if weights > 0.0 else light), total
 
 
 @inlined

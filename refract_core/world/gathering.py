@@ -26,6 +26,7 @@ SECTORS = 36
 _BRANCH = 1 << 17
 """Branch of the sequences of what these rays meet."""
 _FAR = 1e30
+_LEAST_TRUST = 1e-4
 
 
 class GatherScratch(NamedTuple):
@@ -76,10 +77,13 @@ def gather_places(
         if change > 0.0:  # where light changes faster than distances say (Krivanek et al., EGSR 2005)
             lowest = min(lowest, light / math.sqrt(change))
         places.reach[i] = min(max(share * lowest, nearest[i]), farthest[i])
+        places.trust[i] = 1.0
         if places.reach[i] > share * lowest:  # it speaks for more than it knows, so not by its slope
+            known = share * lowest / places.reach[i]
+            places.trust[i] = max(_LEAST_TRUST, known * known)
             for c in range(3):
                 for axis in range(3):
-                    places.shift[i, c, axis] *= share * lowest / places.reach[i]
+                    places.shift[i, c, axis] *= known
     return int(scratch.packet.tally[0])
 
 

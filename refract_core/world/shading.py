@@ -677,6 +677,9 @@ def _add_mirrored(block: Block, second: Block, packet: Packet, world: World, mas
         _add_mirror_ray(block, lane, packet, mask, key)
     intersect_world(packet, world, block.bounce_end, SCATTERED)
     load_hits(second, packet, world, 0.0)
+    for lane in range(LANES):
+        if second.on[lane] != 0:  # rays of a rough mirror share those that its hit may send to each light
+            second.rays[lane] = max(1, block.rays[lane] // block.bounced[lane])
     gather(second, packet, world, mask)
     _add_matt(second)
     for lane in range(LANES):
