@@ -69,7 +69,7 @@ CAUSES = (
     Cause("no camera", r"has no camera"),
     Cause("depth of field", r"depth of field|fStop"),
     Cause("motion blur", r"shutter|motion"),
-    Cause("draw mode", r"drawMode"),
+    Cause("draw mode", r"drawMode is"),
     Cause("subset", r"of its indices are ignored|elementType"),
     Cause("value out of range", r"it is clamped|it must be"),
     Cause("tint without a depth", r"transmission colou?r without a depth"),

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ImageError
+from ..scene import F64
 
 MAX_TEXTURE_PIXELS = 1 << 28
 HALF_MAX = 65504.0
@@ -179,6 +180,30 @@ def read_size(path: str, name: str) -> tuple[int, int, bool]:
         return spec.full_width, spec.full_height, spec.format.basetype in (oiio.UINT8, oiio.INT8)
     finally:
         file.close()
+
+
+def read_matrix(path: str, name: str, wanted: Sequence[str]) -> F64:
+    """A 4 x 4 matrix in the head of a file, shape (4, 4), row vectors, under the first of some names it has.
+
+    Args:
+        wanted: names in lower case
+
+    Raises:
+        ImageError: the file is unreadable, or has no such matrix.
+    """
+    import OpenImageIO as oiio
+
+    file = oiio.ImageInput.open(path)
+    if file is None:
+        raise ImageError(f"{name}: not a readable image: {reason(oiio.geterror(), path)}")
+    try:
+        attributes = {str(one.name).lower(): one.value for one in file.spec().extra_attribs}
+    finally:
+        file.close()
+    for known in wanted:
+        if np.shape(attributes.get(known)) == (16,):
+            return np.asarray(attributes[known], np.float64).reshape(4, 4)
+    raise ImageError(f"{name}: its head has no matrix of 16 numbers named {' or '.join(wanted)}")
 
 
 def check_size(spec: Any, name: str) -> None:

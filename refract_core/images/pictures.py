@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..errors import ImageError, UsageError
 from ..files import check_place, write_whole
-from ..scene import F32, Texture
+from ..scene import F32, F64, Texture
 from .aovs import AOVS, check_names, shape_of
 from .codec import (
     HALF_MAX,
@@ -20,6 +20,7 @@ from .codec import (
     exr_spec,
     extension_of,
     named_file,
+    read_matrix,
     read_parts,
     read_pixels,
     read_size,
@@ -80,6 +81,17 @@ def texture_size(source: str | bytes, name: str) -> tuple[int, int, bool]:
     """
     with named_file(source, name) as path:
         return read_size(path, name)
+
+
+def world_to_screen(source: str | bytes, name: str) -> F64:
+    """The matrix that a picture was projected by, shape (4, 4), row vectors: to -1 .. 1 across and upwards. Files
+    that older OpenImageIO wrote have it as worldToNDC.
+
+    Raises:
+        ImageError: unreadable, or the file has none.
+    """
+    with named_file(source, name) as path:
+        return read_matrix(path, name, ("worldtoscreen", "worldtondc"))
 
 
 def read_planes(path: str) -> dict[str, F32]:

@@ -242,7 +242,7 @@ def _read(
     metres_per_unit = stage_unit(stage, notices)
     metres_from_stage = _upright(stage, notices) @ np.diag([metres_per_unit] * 3 + [1.0])
     tables = Tables(time, metres_per_unit, notices, FINENESS[complexity])
-    drawn = walk(stage, time, purposes, notices)
+    drawn = walk(stage, time, purposes, notices, draw_modes=True)
     placed, groups, clouds = _placed(stage, keep(drawn, tables) if keep else drawn, metres_from_stage, tables)
     extent = _extent([bounds_of(placed), *map(bounds_of_group, groups), *map(bounds_of_cloud, clouds)])
     if extent is None:

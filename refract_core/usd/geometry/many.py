@@ -81,7 +81,7 @@ def shared(
         part = parts[placement.prim.GetPath()]
         if part is None:
             continue
-        many = len(placement.worlds) > 1 or placement.prim.IsInstanceProxy()
+        many = len(placement.worlds) > 1 or placement.prim.IsInstanceProxy() or placement.stands_in is not None
         if many and str(placement.prim.GetPath()) not in own:
             together.setdefault(_likeness(part, placement, tables), []).append((number, placement))
         else:

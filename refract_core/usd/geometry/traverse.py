@@ -12,6 +12,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom
 from ...errors import StageError
 from ...scene import F64, I32, Notice, Run
 from .gprims import ATTRIBUTES
+from .standins import INHERITED, MODES, StandIns, own_cards, own_mode, takes
 from .triangulate import Index
 
 MAX_INSTANCES = 4_000_000
@@ -60,6 +61,8 @@ class Placement(NamedTuple):
     """Nothing that moves it varies in time, and `primvars:refract:static` is not 0."""
     instance: tuple[Usd.Prim, I32] | None = None
     """The innermost point instancer and, of shape (N,), the index in it."""
+    stands_in: Usd.Stage | None = None
+    """The stage of `prim`, where that stands for a model by its draw mode; it lives as long as this"""
 
     @property
     def path(self) -> str:
@@ -75,7 +78,7 @@ class Placement(NamedTuple):
         """Some of its places."""
         instance = None if self.instance is None else (self.instance[0], self.instance[1][rows])
         run = Run(self.run.pieces, self.run.numbers[rows])
-        return Placement(self.prim, run, self.worlds[rows], self.static, instance)
+        return self._replace(run=run, worlds=self.worlds[rows], instance=instance)
 
 
 _ONE = np.zeros((1, 0), np.int32)
@@ -88,6 +91,9 @@ class _Node(NamedTuple):
     """What its own transform is relative to; row vectors."""
     purpose: UsdGeom.Imageable.PurposeInfo
     static: bool
+    mode: str = INHERITED
+    """`model:drawMode` and `model:cardVisibility` from above"""
+    cards: str = INHERITED
 
 
 @dataclass
@@ -99,29 +105,37 @@ class _Walk:
     notices: list[Notice]
     cache: UsdGeom.XformCache
     unsupported: dict[str, list[str]] = field(default_factory=dict)
-    drawn_otherwise: list[str] = field(default_factory=list)
-    """Models whose draw mode asks for bounds, an origin or cards."""
+    stand_ins: StandIns | None = None
+    """What is drawn for models whose draw mode asks for bounds, an origin or cards; None: the models themselves"""
+    drawn_otherwise: dict[str, list[str]] = field(default_factory=dict)
+    """Those models, by their draw mode."""
     visited: int = 0
     expanded: int = 0
     within: tuple[Sdf.Path, ...] = ()
     """Point instancers being expanded, outermost first."""
 
 
-def walk(stage: Usd.Stage, time: Usd.TimeCode, purposes: tuple[str, ...], notices: list[Notice]) -> list[Placement]:
+def walk(
+    stage: Usd.Stage, time: Usd.TimeCode, purposes: tuple[str, ...], notices: list[Notice], *, draw_modes: bool = False
+) -> list[Placement]:
     """Every visible prim with a surface, in the order of the stage.
+
+    Args:
+        draw_modes: models are drawn as their `model:drawMode` asks; else as what they are made of
 
     Raises:
         StageError: where instances expand to more than `MAX_INSTANCES` or `MAX_PRIMS` prims.
     """
     state = _Walk(time, frozenset(purposes), notices, UsdGeom.XformCache(time))
+    state.stand_ins = StandIns(stage, notices) if draw_modes else None
     start = _Node(stage.GetPseudoRoot(), Gf.Matrix4d(1.0), UsdGeom.Imageable.PurposeInfo(), True)
     found = list(_descend(state, start, Usd.TraverseInstanceProxies(), 0))
     for kind, paths in sorted(state.unsupported.items()):
         what = _INSTEAD.get(kind, "convert it to a Mesh")
         notices.append(Notice(paths[0], f"{kind} is not rendered; {what} ({some_of(paths)})"))
-    if state.drawn_otherwise:
-        text = f"model:drawMode is ignored, the geometry itself is drawn ({some_of(state.drawn_otherwise)})"
-        notices.append(Notice(state.drawn_otherwise[0], text))
+    for mode, paths in sorted(state.drawn_otherwise.items()):
+        text = f"drawn as {mode} and not as what is in it, for its model:drawMode says so ({some_of(paths)})"
+        notices.append(Notice(paths[0], text))
     return found
 
 
@@ -187,6 +201,9 @@ def _descend(
             continue
         here = _enter(state, node, moves=not (placed and node is start))
         label = str(prim.GetPath())[cut:]
+        if state.stand_ins is not None and here.mode in MODES and takes(prim):
+            yield from _stand_in(state, state.stand_ins, here, label)
+            continue
         if prim.IsA(UsdGeom.PointInstancer):
             yield from _instances(state, here, label)
             continue
@@ -197,12 +214,12 @@ def _descend(
             else:
                 state.unsupported.setdefault(kind, []).append(label)
         children = prim.GetFilteredChildren(predicate)
-        stack.extend(_Node(child, here.world, here.purpose, here.static) for child in reversed(children))
+        stack.extend(here._replace(prim=child) for child in reversed(children))
 
 
 def _enter(state: _Walk, node: _Node, *, moves: bool) -> _Node:
     """What holds at the prim itself and is handed to its children."""
-    prim, world, purpose, static = node
+    prim, world, purpose, static, mode, cards = node
     imageable = UsdGeom.Imageable(prim)
     if imageable:
         purpose = imageable.ComputePurposeInfo(purpose)
@@ -211,13 +228,23 @@ def _enter(state: _Walk, node: _Node, *, moves: bool) -> _Node:
         local, resets = state.cache.GetLocalTransformation(prim)
         world = local if resets else local * world
         static = static and not xformable.TransformMightBeTimeVarying()
-    mode = prim.GetAttribute("model:drawMode")
-    if mode and mode.Get(state.time) not in (None, UsdGeom.Tokens.default_, UsdGeom.Tokens.inherited):
-        state.drawn_otherwise.append(str(prim.GetPath()))
+    if state.stand_ins is not None:
+        mode, cards = own_mode(prim, mode), own_cards(prim, cards)
     said = prim.GetAttribute("primvars:refract:static")
     if said and said.HasAuthoredValue():
         static = bool(said.Get(state.time)) and static
-    return _Node(prim, world, purpose, static)
+    return _Node(prim, world, purpose, static, mode, cards)
+
+
+def _stand_in(state: _Walk, stand_ins: StandIns, node: _Node, label: str) -> Iterator[Placement]:
+    """What is drawn for a model instead of what is below it."""
+    if not _wanted(state, node):
+        return
+    state.drawn_otherwise.setdefault(node.mode, []).append(label)
+    drawn = stand_ins.of(node.prim, node.mode, node.cards)
+    if drawn is not None:
+        world = np.array(node.world).T[None, :3]
+        yield Placement(drawn, Run((label,), _ONE), world, node.static, stands_in=stand_ins.stage)
 
 
 def _wanted(state: _Walk, node: _Node) -> bool:
@@ -259,7 +286,7 @@ def _multiplied(
     outer = np.broadcast_to(numbers[:, None, None], (places, each, 1))
     run = Run((f"{label}/[", f"]{first}", *rest), np.concatenate([outer, inner], axis=2).reshape(places * each, -1))
     instance = (instancer, numbers) if part.instance is None else (part.instance[0], np.tile(part.instance[1], places))
-    return Placement(part.prim, run, worlds.reshape(-1, 3, 4), part.static, instance)
+    return part._replace(run=run, worlds=worlds.reshape(-1, 3, 4), instance=instance)
 
 
 def _prototype(state: _Walk, node: _Node, target: Sdf.Path, static: bool, *, drawn: int) -> list[Placement]:
@@ -270,7 +297,7 @@ def _prototype(state: _Walk, node: _Node, target: Sdf.Path, static: bool, *, dra
         state.notices.append(Notice(str(node.prim.GetPath()), text))
     if not root or not drawn:
         return []
-    start = _Node(root, Gf.Matrix4d(1.0), node.purpose, static)
+    start = _Node(root, Gf.Matrix4d(1.0), node.purpose, static, *_modes_above(root))
     parts = list(_descend(state, start, _PROTOTYPES, len(str(target)) - len(target.name) - 1, placed=True))
     state.expanded += sum(len(part.worlds) for part in parts) * drawn
     if state.expanded > MAX_INSTANCES:
@@ -279,6 +306,15 @@ def _prototype(state: _Walk, node: _Node, target: Sdf.Path, static: bool, *, dra
             f"{MAX_INSTANCES} can be rendered. Deactivate some instances or merge the prototype's meshes"
         )
     return parts
+
+
+def _modes_above(prim: Usd.Prim) -> tuple[str, str]:
+    """Draw mode and card visibility that a prototype has from where it is, which may not be where it is drawn."""
+    mode, cards = INHERITED, INHERITED
+    for path in prim.GetPath().GetParentPath().GetPrefixes():
+        above = prim.GetStage().GetPrimAtPath(path)
+        mode, cards = own_mode(above, mode), own_cards(above, cards)
+    return mode, cards
 
 
 def _placed_instances(state: _Walk, instancer: UsdGeom.PointInstancer) -> tuple[I32, I32, F64]:

@@ -9,7 +9,7 @@ from pxr import Ar, Sdf, Usd, UsdShade
 
 from ...errors import ImageError
 from ...images.spaces import AUTO, NAMES, RAW, SRGB, canonical, told
-from ...scene import Texture
+from ...scene import F64, Texture
 from ..values import short
 from .udim import Size, is_tiled, read_tiles
 
@@ -83,6 +83,17 @@ def read_texture(path: str, color_space: str) -> Texture:
             lambda tile: decode(file_of(tile), name=short(tile), color_space=color_space),
         )  # fmt: skip
     return decode(file_of(path), name=name, color_space=color_space)
+
+
+def screen_of(path: str) -> F64:
+    """The matrix a picture was projected by, shape (4, 4), row vectors, as `pictures.world_to_screen` has it.
+
+    Raises:
+        ImageError: the file is absent, cannot be read, or has none.
+    """
+    from ...images.pictures import world_to_screen
+
+    return world_to_screen(file_of(path), short(path))
 
 
 def _there(path: str) -> bool:
