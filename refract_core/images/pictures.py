@@ -50,7 +50,7 @@ def read_texture(source: str | bytes, *, name: str, color_space: str) -> Texture
     Missing channels are filled as UsdUVTexture does: one channel is grey, two are grey and alpha, and alpha is 1
     where the file has none. Values stay as the file has them, never premultiplied. 8-bit files stay uint8; 16-bit
     integers become float32 in [0, 1], and with them whatever has a space that bytes cannot be kept in. Half and float
-    files hold linear light, so of their colour space the primaries count alone.
+    files hold linear light, so of their colour space the primaries count alone, unless it is a logarithm.
 
     Args:
         source: a path, or the bytes of a file (from inside a package).

@@ -1,7 +1,8 @@
 """Colour spaces by the names that USD, MaterialX and OpenColorIO have for them, and the way to linear Rec. 709.
 
 A space is a set of primaries with a white point, and a curve. Primaries are those of the standards: ITU-R BT.709-6,
-BT.2020-2, SMPTE EG 432-1 (P3), Adobe RGB (1998), SMPTE ST 2065-1 and S-2014-004 (ACES); white points other than D65 are
+BT.2020-2, SMPTE EG 432-1 (P3), Adobe RGB (1998), SMPTE ST 2065-1 and S-2014-004 (ACES); logarithms those of S-2014-003
+(ACEScc) and S-2016-001 (ACEScct); white points other than D65 are
 adapted by Bradford's cone responses, as OpenColorIO's ACES configurations do.
 """
 
@@ -21,6 +22,9 @@ AUTO, RAW, SRGB = "auto", "raw", "sRGB"
 """What a picture's own format says, numbers as they are (linear Rec. 709 too), and sRGB's curve."""
 _ENCODED = -1.0
 """The curve of sRGB, in the place of an exponent."""
+_CC, _CCT = -2.0, -3.0
+"""Likewise those of ACEScc and ACEScct."""
+_LOGARITHMS = (_CC, _CCT)
 
 _Pair = tuple[float, float]
 
@@ -45,6 +49,7 @@ LINEAR_REC709 = "lin_rec709_scene"
 """The space that the renderer computes in, by the name of the Color Interop Forum."""
 CHROMATICITIES_REC709 = (*_REC709.red, *_REC709.green, *_REC709.blue, *_REC709.white)
 """Its primaries and its white, as OpenEXR has them."""
+_TOP = (np.log2(65504.0) + 9.72) / 17.52
 _XYZ = _Gamut((1.0, 0.0), (0.0, 1.0), (0.0, 0.0), _D65)
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 
@@ -52,7 +57,7 @@ _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0
 class _Space(NamedTuple):
     gamut: _Gamut
     exponent: float
-    """1: linear; _ENCODED: sRGB's curve"""
+    """1: linear; _ENCODED, _CC, _CCT: a curve of its own"""
     others: tuple[str, ...] = ()
     """More names, as `_plain` has them."""
 
@@ -75,6 +80,8 @@ _SPACES: dict[str, _Space] = {
     "lin_ap1": _Space(_AP1, 1.0, ("linap1scene", "acescg", "acesacescg", "linearap1", "linacescg")),
     "srgb_ap1": _Space(_AP1, _ENCODED, ("srgbap1scene", "srgbencodedap1", "srgbencodedap1texture")),
     "g22_ap1": _Space(_AP1, 2.2, ("g22ap1scene", "gamma22encodedap1", "gamma22ap1texture")),
+    "acescc": _Space(_AP1, _CC, ("acesacescc", "acesccap1scene")),
+    "acescct": _Space(_AP1, _CCT, ("acesacescct", "acescctap1scene")),
     "lin_ap0": _Space(_AP0, 1.0, ("linap0scene", "aces20651", "acesaces20651", "linearap0")),
     "lin_p3d65": _Space(_P3, 1.0, (
         "linp3d65scene", "linearp3d65", "lindisplayp3", "lindisplayp3scene", "utilitylinearp3d65", "lineardisplayp3",
@@ -161,7 +168,26 @@ def decoded(values: F32, space: str) -> F32:
         return values
     if exponent == _ENCODED:
         return srgb_decode(values)
+    if exponent in _LOGARITHMS:
+        return _power(values, toe=exponent == _CCT)
     return (np.sign(values) * np.abs(values) ** exponent).astype(np.float32)
+
+
+def _power(values: F32, *, toe: bool) -> F32:
+    """ACEScc taken off, or with its straight toe ACEScct: S-2014-003 and S-2016-001, 4.4.2 each. Never over what half
+    numbers hold."""
+    code = values.astype(np.float64)
+    light = np.exp2(np.minimum(code, _TOP) * 17.52 - 9.72)
+    if toe:
+        dark, low = code <= 0.155251141552511, (code - 0.0729055341958355) / 10.5402377416545
+    else:
+        dark, low = code <= (9.72 - 15.0) / 17.52, (light - 2.0**-16) * 2.0
+    return np.where(dark, low, light).astype(np.float32)
+
+
+def _keeps_curve(space: str) -> bool:
+    """Half and float files in it carry its curve, too: nobody calls linear light a logarithm."""
+    return _SPACES[space].exponent in _LOGARITHMS
 
 
 def is_rec709(space: str) -> bool:
@@ -187,11 +213,12 @@ def picture(pixels: NDArray[np.uint8] | F32, space: str, *, encoded: bool) -> F3
     Args:
         pixels: shape (H, W, 4); bytes are taken to 0 .. 1.
         space: one of `NAMES`, but not auto.
-        encoded: its numbers carry the curve of the space, which those of half and float files do not.
+        encoded: its numbers carry the curve of the space, which those of half and float files do not, but for
+            logarithms.
     """
     out = as_floats(pixels)
     matrix = to_rec709(space).T.astype(np.float32)
     for row in out:  # row by row: of the whole picture, each step would be one more copy
-        rgb = decoded(row[:, :3], space) if encoded else row[:, :3]
+        rgb = decoded(row[:, :3], space) if encoded or _keeps_curve(space) else row[:, :3]
         row[:, :3] = rgb if is_rec709(space) else rgb @ matrix
     return out

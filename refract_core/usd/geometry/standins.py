@@ -28,7 +28,7 @@ _THRESHOLD = 0.1
 """Alpha under which a card is not there."""
 _GAP = 1.0e-4
 """Between the two cards of a cross that look opposite ways, of the model's size: each hides the other from its side."""
-_THIN = 0.004
+_THIN = 0.006
 """Width of the lines of `bounds`, of the box's diagonal, and of those of `origin`, of their length."""
 _RIGHT_UP = {
     "XPos": ((0, 1, 0), (0, 0, 1)), "XNeg": ((0, -1, 0), (0, 0, 1)), "YPos": ((-1, 0, 0), (0, 0, 1)),
