@@ -39,7 +39,8 @@ def test_every_space_is_what_openusd_makes_of_it(space: str, colour: tuple[float
     ("space", "theirs"),
     [("lin_ap1", "ACEScg"), ("lin_ap0", "ACES2065-1"), ("g22_adobergb", "Gamma 2.2 Encoded AdobeRGB"),
      ("lin_p3d65", "Linear P3-D65"), ("lin_rec2020", "Linear Rec.2020"), ("sRGB", "sRGB Encoded Rec.709 (sRGB)"),
-     ("acescc", "ACEScc"), ("acescct", "ACEScct"), ("g18_rec709", "Gamma 1.8 Encoded Rec.709"), ("srgb_ap1", "sRGB Encoded AP1")],
+     ("acescc", "ACEScc"), ("acescct", "ACEScct"), ("g18_rec709", "Gamma 1.8 Encoded Rec.709"),
+     ("srgb_ap1", "sRGB Encoded AP1")],
 )  # fmt: skip
 def test_and_what_opencolorio_does(space: str, theirs: str) -> None:
     """By the configuration that OpenColorIO has built in; its own name is known, too."""

@@ -189,6 +189,9 @@ KINDS = {
     "instancer": 'def PointInstancer "P" { rel prototypes = </P/Card>\nint[] protoIndices = [0, 0]\n'
     "point3f[] positions.timeSamples = { -0.5: [(-1, 0, 0), (1, 0, 0)], 0.5: [(-1, -1, 0), (1, 1, 0)] }\n"
     + card() + "}",
+    "velocities": card("vector3f[] velocities.timeSamples = { 0: [(20, 0, 0), (20, 0, 0), (20, 9, 0), (20, 0, 0)] }")
+    .replace("points = [(-0.5, -0.5, 0), (0.5, -0.5, 0), (0.5, 0.5, 0), (-0.5, 0.5, 0)]",
+             "points.timeSamples = { 0: [(-0.5, -0.5, 0), (0.5, -0.5, 0), (0.5, 0.5, 0), (-0.5, 0.5, 0)] }"),
     "visibility": card('token visibility.timeSamples = { -0.5: "inherited", 0.1: "invisible" }'),
     "skeleton": 'def SkelRoot "Body" { '
     + card("""rel skel:skeleton = </Body/Bones>
@@ -224,6 +227,77 @@ def test_a_picture_is_the_mean_of_stills(kind: str) -> None:
     assert np.abs(still(read, 0.0).planes["beauty"] - stills).mean() > 2 * apart  # it does move
 
 
+# --- velocities -----------------------------------------------------------------------------------------------------
+
+
+def flying(kind: str, said: str) -> str:
+    """Two points, or as many corners as a kind needs, with samples at 0 and 2 of different numbers of points."""
+    faces = "int[] faceVertexCounts = [3]\nint[] faceVertexIndices = [0, 1, 2]\n"
+    faces += "uniform token subdivisionScheme = 'none'"
+    curves = "int[] curveVertexCounts = [3]\nuniform token type = 'linear'"
+    more = {"Mesh": faces, "Points": "", "BasisCurves": curves}[kind]
+    return f"""def {kind} "F" {{ {more}
+        float[] widths = [0.1] (interpolation = "constant")
+        point3f[] points.timeSamples = {{ 0: [(0, 0, 0), (1, 0, 0), (0, 1, 0)],
+            2: [(9, 0, 0), (9, 1, 0), (9, 0, 1), (9, 9, 9)] }}
+        {said} }}"""
+
+
+def middle(scene: Scene) -> F64:
+    """Of the bounds of everything, in the stage's world."""
+    (low, high), matrix = scene.bounds, scene.stage_from_engine
+    return (np.asarray(low) + np.asarray(high)) / 2.0 @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+@pytest.mark.parametrize("kind", ["Mesh", "Points", "BasisCurves"])
+@pytest.mark.parametrize("fast", [False, True])
+def test_points_fly_by_their_velocities_and_accelerations(kind: str, fast: bool) -> None:
+    """p + v t + a t^2 / 2, t in seconds since the sample before, whatever the next sample is."""
+    v, a, rate = np.array([24.0, 0.0, -12.0]), np.array([0.0, 96.0, 0.0]) * fast, 24.0
+    said = f"vector3f[] velocities.timeSamples = {{ 0: {[tuple(v.tolist())] * 3}, 2: {[tuple(v.tolist())] * 4} }}\n"
+    if fast:
+        said += f"vector3f[] accelerations.timeSamples = {{ 0: {[tuple(a.tolist())] * 3}, "
+        said += f"2: {[tuple(a.tolist())] * 4} }}"
+    read = at(flying(kind, said))
+    start = middle(read(0.0))
+    for code in (0.5, 1.0, 1.75):
+        t = code / rate
+        np.testing.assert_allclose(middle(read(code)) - start, v * t + a * t * t / 2.0, atol=1e-5)
+    assert middle(read(2.0))[0] > 8.0  # the next sample is where it says
+
+
+@pytest.mark.parametrize("kind", ["Mesh", "Points", "BasisCurves"])
+def test_without_velocities_what_changes_its_number_of_points_steps(kind: str) -> None:
+    read = at(flying(kind, ""))
+    np.testing.assert_allclose(middle(read(1.9)), middle(read(0.0)), atol=1e-6)
+
+
+def test_velocities_win_over_the_next_sample() -> None:
+    here, there = "[(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]", "[(5, 5, 5), (6, 5, 5), (6, 6, 5), (5, 6, 5)]"
+    up = [(0, 24, 0)] * 4
+    text = card(f"vector3f[] velocities.timeSamples = {{ 0: {up}, 1: {up} }}").replace(
+        "points = [(-0.5, -0.5, 0), (0.5, -0.5, 0), (0.5, 0.5, 0), (-0.5, 0.5, 0)]",
+        f"points.timeSamples = {{ 0: {here}, 1: {there} }}",
+    )
+    np.testing.assert_allclose(middle(at(text)(0.5)), (0.5, 1.0, 0.0), atol=1e-5)
+
+
+def test_velocities_of_another_length_are_named_and_not_used() -> None:
+    scene = at(flying("Mesh", "vector3f[] velocities.timeSamples = { 0: [(24, 0, 0)], 2: [(24, 0, 0)] }"))(1.0)
+    assert any("velocities" in notice.text and "/F" in notice.text for notice in scene.notices)
+    np.testing.assert_allclose(middle(scene), middle(at(flying("Mesh", ""))(1.0)), atol=1e-6)
+
+
+def test_a_card_that_flies_looks_like_one_that_is_moved() -> None:
+    """One sample of its points, and its velocity: 24 units a second are one unit a frame of 1/24 s."""
+    corners = "[(-0.5, -0.5, 0), (0.5, -0.5, 0), (0.5, 0.5, 0), (-0.5, 0.5, 0)]"
+    flies = card("vector3f[] velocities.timeSamples = { 0: [(24, 0, 0), (24, 0, 0), (24, 0, 0), (24, 0, 0)] }").replace(
+        f"points = {corners}", f"points.timeSamples = {{ 0: {corners} }}"
+    )
+    mine, other = blurred(at(flies + eye())), blurred(at(card(moving(-0.5, 0.5)) + eye()))
+    assert np.abs(mine.planes["beauty"] - other.planes["beauty"]).mean() < 1e-3
+
+
 # --- nothing to blur ------------------------------------------------------------------------------------------------
 
 STANDS = {
@@ -232,6 +306,7 @@ STANDS = {
     "nothing moves": card() + eye(),
     "it says the same again": card(moving(0.2, 0.2)) + eye(),
     "it moves at other times": card(moving(-0.5, 0.5).replace("-0.5:", "3:").replace(" 0.5:", " 4:")) + eye(),
+    "velocities of nothing": card("vector3f[] velocities.timeSamples = { 0: [(0, 0, 0), (0, 0, 0)] }") + eye(),
     "nothing that is drawn": card("custom float frame.timeSamples = { -0.5: 0, 0.5: 1 }") + eye(),
 }
 

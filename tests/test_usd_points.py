@@ -59,8 +59,10 @@ def test_what_has_no_width_is_named() -> None:
     assert not points("float[] widths = [1, 2]").balls
 
 
-def test_velocities_are_ignored_and_said() -> None:
-    assert "velocities are ignored" in texts(points("vector3f[] velocities = [(1, 0, 0), (1, 0, 0), (1, 0, 0)]"), "/P")
+def test_velocities_without_a_time_move_nothing() -> None:
+    """USD counts seconds from the sample that they are of."""
+    scene = points("vector3f[] velocities = [(1, 0, 0), (1, 0, 0), (1, 0, 0)]")
+    np.testing.assert_allclose(to_stage(scene, only(scene).centres), [(0, 0, 0), (4, 0, 0), (0, 6, 0)], atol=1e-6)
 
 
 def test_each_point_has_its_colour() -> None:

@@ -9,6 +9,7 @@ from itertools import chain
 from pxr import Gf, Usd, UsdGeom
 
 from ..scene import Camera, Notice
+from .geometry.moving import FLIGHT, flies, moves_between
 
 CLOSED = (0.0, 0.0)
 _OURS = ("primvars:", "inputs:", "refract:", "xformOp:")
@@ -58,13 +59,19 @@ def moves(stage: Usd.Stage, first: float, last: float) -> bool:
         _varies(attribute, first, last)
         for prim in every
         for attribute in prim.GetAuthoredAttributes()
-        if attribute.ValueMightBeTimeVarying() and (not attribute.IsCustom() or attribute.GetName().startswith(_OURS))
+        if _may_move(attribute) and (not attribute.IsCustom() or attribute.GetName().startswith(_OURS))
     )
+
+
+def _may_move(attribute: Usd.Attribute) -> bool:
+    return attribute.ValueMightBeTimeVarying() or (attribute.GetName() in FLIGHT and flies(attribute))
 
 
 def _varies(attribute: Usd.Attribute, first: float, last: float) -> bool:
     """By its values at both ends and at every sample in between, for what is between two samples is between their
-    values; a spline is taken to move."""
+    values; a spline is taken to move, and a velocity that is not 0 moves."""
+    if attribute.GetName() in FLIGHT:
+        return moves_between(attribute, first, last)
     if attribute.HasSpline():
         return True
     within = attribute.GetTimeSamplesInInterval(Gf.Interval(first, last, False, False))

@@ -1,6 +1,6 @@
 """Prims with a surface as triangles at their places in engine world. Knows no light and no camera."""
 
 __all__ = [
-    "cages", "curves", "dots", "many", "parts", "place", "primvars", "refined", "shapes", "skel", "traverse",
-    "triangulate", "ways",
+    "cages", "curves", "dots", "many", "moving", "parts", "place", "primvars", "refined", "shapes", "skel",
+    "traverse", "triangulate", "ways",
 ]  # fmt: skip

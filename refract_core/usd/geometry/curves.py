@@ -13,13 +13,14 @@ from pxr import Sdf, Usd, UsdGeom
 from ...scene import F32, F64, Notice
 from .along import BASES, STRAIGHT, Along, Rule
 from .cages import integers
+from .moving import FLIGHT, points_at
 from .primvars import LARGEST, Topology, Unusable, as_values
 from .refined import Fineness
 from .traverse import CURVES, FEW, Placement, some_of
 from .triangulate import Index
 from .tubes import Rings, Sides, directions, ribbons, tubes
 
-ATTRIBUTES = ("points", "curveVertexCounts", "widths", "normals", "tangents", "type", "basis", "wrap")
+ATTRIBUTES = ("points", "curveVertexCounts", "widths", "normals", "tangents", "type", "basis", "wrap", *FLIGHT)
 WIDTH = 1.0
 """[units of the prim] of curves that say nothing of it, as Hydra has it."""
 LIMIT = {2: 1_000_000, 3: 2_000_000, 4: 3_000_000, 5: 4_000_000}
@@ -216,7 +217,7 @@ def _usable(
     """
     _checked(rule)
     curves = UsdGeom.Curves(prim)
-    values, counts = as_values(curves.GetPointsAttr().Get(time)), integers(curves.GetCurveVertexCountsAttr().Get(time))
+    values, counts = as_values(points_at(prim, time)), integers(curves.GetCurveVertexCountsAttr().Get(time))
     if values is None or not len(values) or values.shape[1] != 3:
         raise Unusable("it has no points at this time")
     if not len(counts):

@@ -19,6 +19,7 @@ from ...errors import StageError
 from ...scene import F32, F64, Notice, Paths, Run
 from .gprims import unit_sphere
 from .many import Cloud, Group, even_scales, in_metres
+from .moving import FLIGHT, points_at
 from .parts import Bound, Part, Tables, assemble
 from .place import BEYOND, NOTHING_LEFT, of_instances
 from .primvars import LARGEST, Topology, Unusable, as_values, read_primvar
@@ -30,7 +31,7 @@ MOST = 8_000_000
 """Points that a stage may draw, counted wherever they are drawn."""
 WIDTH = 1.0
 """Of points without widths, which the schema leaves open; usdview draws them so."""
-_MOVES = ("points", "widths", "primvars:widths")
+_MOVES = ("points", "widths", "primvars:widths", *FLIGHT)
 
 
 class Dots(NamedTuple):
@@ -51,16 +52,13 @@ def read_dots(prim: Usd.Prim, bound: Bound, tables: Tables) -> Dots | None:
     """The points of a prim; None, with a notice that says why, where nothing is left to draw."""
     path, told = str(prim.GetPath()), tables.notices
     dots = UsdGeom.Points(prim)
-    value = dots.GetPointsAttr().Get(tables.time)
+    value = points_at(prim, tables.time)
     points = np.zeros((0, 3)) if value is None else np.asarray(value, np.float64).reshape(-1, 3)
     if not len(points):
         told.append(Notice(path, "skipped: it has no points at this time"))
         return None
     if len(points) > MOST:
         raise StageError(f"{path}: it has {len(points)} points; at most {MOST} can be rendered")
-    for name in ("velocities", "accelerations"):
-        if prim.GetAttribute(name).Get(tables.time):
-            told.append(Notice(path, f"{name} are ignored: points are drawn where they are at one time"))
     topology = _topology(len(points))
     try:
         radii = _radii(dots, topology, tables)

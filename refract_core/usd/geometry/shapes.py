@@ -24,6 +24,7 @@ from .cages import (
     steps_of,
     without_repeats,
 )
+from .moving import FLIGHT, flies, points_at
 from .primvars import LARGEST, WHOLE, Corners, Topology, Unusable, as_values, evaluate, to_corners
 from .refined import Fineness, surface
 from .traverse import CURVES
@@ -42,7 +43,7 @@ from .triangulate import (
 INWARDS = "the mesh is closed but its faces look inwards"
 TURN = "turn its orientation attribute round, or reverse its faces"
 """What to do about it."""
-_MESH_ATTRIBUTES = ("points", "faceVertexCounts", "faceVertexIndices", "holeIndices", "normals")
+_MESH_ATTRIBUTES = ("points", "faceVertexCounts", "faceVertexIndices", "holeIndices", "normals", *FLIGHT)
 _HIDDEN = ", or touch a boundary and interpolateBoundary is none, or have no area"
 _IDENTITY = np.eye(4)
 _SMALL = 512
@@ -134,8 +135,9 @@ def read_shape(
 
 def varies(prim: Usd.Prim, names: tuple[str, ...]) -> bool:
     """Whether any of these attributes may be another one at another time."""
-    authored = prim.GetAuthoredPropertyNames()
-    return any(name in authored and prim.GetAttribute(name).ValueMightBeTimeVarying() for name in names)
+    authored = [name for name in prim.GetAuthoredPropertyNames() if name in names]
+    found = map(prim.GetAttribute, authored)
+    return any(one.ValueMightBeTimeVarying() or (one.GetName() in FLIGHT and flies(one)) for one in found)
 
 
 def _read_gprim(prim: Usd.Prim, time: Usd.TimeCode) -> Shape:
@@ -350,7 +352,7 @@ def _usable_faces(mesh: UsdGeom.Mesh, time: Usd.TimeCode, *, surface: bool = Fal
     Raises:
         Unusable: where there are no points or faces, or a count is negative, so that no face can be told from another.
     """
-    values = as_values(mesh.GetPointsAttr().Get(time))
+    values = as_values(points_at(mesh.GetPrim(), time))
     counts = integers(mesh.GetFaceVertexCountsAttr().Get(time))
     indices = integers(mesh.GetFaceVertexIndicesAttr().Get(time))
     if values is None or not len(values) or values.shape[1] != 3:

@@ -12,6 +12,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom
 from ...errors import StageError
 from ...scene import F64, I32, Notice, Run
 from .gprims import ATTRIBUTES
+from .moving import FLIGHT, flies
 from .standins import INHERITED, MODES, StandIns, own_cards, own_mode, takes
 from .triangulate import Index
 
@@ -259,7 +260,8 @@ def _instances(state: _Walk, node: _Node, label: str) -> Iterator[Placement]:
         state.notices.append(Notice(str(path), "the instancer is among its own prototypes; it is not drawn there"))
         return
     numbers, prototypes, transforms = _placed_instances(state, instancer)
-    static = node.static and not any(prim.GetAttribute(n).ValueMightBeTimeVarying() for n in _INSTANCER_ATTRIBUTES)
+    varying = any(prim.GetAttribute(name).ValueMightBeTimeVarying() for name in _INSTANCER_ATTRIBUTES)
+    static = node.static and not varying and not any(flies(prim.GetAttribute(name)) for name in FLIGHT)
     outer, state.within = state.within, (*state.within, path)
     world = np.array(node.world).T
     for place, target in enumerate(instancer.GetPrototypesRel().GetForwardedTargets()):
