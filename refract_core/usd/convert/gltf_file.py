@@ -1,8 +1,8 @@
 """A glTF 2.0 file as plain arrays: nodes, triangles, materials with their KHR extensions, pictures as bytes.
 
 pygltflib parses the file and keeps every extension; what its accessors and materials mean is done here after the
-specification (Khronos glTF 2.0, sections 3.6, 3.7 and 3.9). Morph targets, skins, animations, cameras and lights are
-left out, and said so.
+specification (Khronos glTF 2.0, sections 3.6, 3.7, 3.9 and 3.10, and KHR_lights_punctual). Morph targets, skins and
+animations are left out, and said so.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ...errors import StageError, UsageError
 from ...scene import F32, F64, I32, Notice
+from .gltf_lamps import EXTENSION, Lamp, View, read_lamp, read_view
 
 _KINDS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -87,13 +88,15 @@ class Primitive:
 
 @dataclass(frozen=True)
 class Node:
-    """A place in the hierarchy, with a mesh (-1: none) and what hangs below it."""
+    """A place in the hierarchy, with a mesh, a camera and a light (-1: none) and what hangs below it."""
 
     name: str
     matrix: F64
     """shape (4, 4), column vectors: parent from node"""
     mesh: int
     children: tuple[int, ...]
+    camera: int = -1
+    light: int = -1
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,8 @@ class Gltf:
     roots: tuple[int, ...]
     meshes: tuple[tuple[str, tuple[Primitive, ...]], ...]
     materials: tuple[GltfMaterial, ...]
+    cameras: tuple[View, ...]
+    lights: tuple[Lamp, ...]
     images: tuple[tuple[str, bytes], ...]
     """File extension and content; no content where it cannot be had"""
     notices: tuple[Notice, ...]
@@ -149,7 +154,7 @@ class _File:
 def _read(file: _File) -> Gltf:
     """The parts of a parsed file. Raises ValueError or LookupError where it refers to what is not there."""
     document = file.document
-    left = {"skins": document.skins, "animations": document.animations, "cameras": document.cameras}
+    left = {"skins": document.skins, "animations": document.animations}
     if found := [name for name, values in left.items() if values]:
         _say(file, f"{', '.join(found)} are not converted: geometry is taken as it rests")
     children = [child for node in document.nodes for child in node.children or ()]
@@ -162,6 +167,8 @@ def _read(file: _File) -> Gltf:
         roots=tuple(roots or ()),
         meshes=tuple((mesh.name or "Mesh", _primitives(file, mesh)) for mesh in document.meshes),
         materials=tuple(_material(file, one, number) for number, one in enumerate(document.materials)),
+        cameras=tuple(read_view(camera) for camera in document.cameras or ()),
+        lights=tuple(read_lamp(one) for one in (document.extensions or {}).get(EXTENSION, {}).get("lights", ())),
         images=tuple(_image(file, number) for number in range(len(document.images))),
         notices=tuple(dict.fromkeys(file.notices)),
     )
@@ -393,4 +400,6 @@ def _node(node: Any, number: int) -> Node:
         matrix[:3, :3] = turned * np.array(node.scale or (1.0, 1.0, 1.0))
         matrix[:3, 3] = node.translation or (0.0, 0.0, 0.0)
     mesh = -1 if node.mesh is None else int(node.mesh)
-    return Node(node.name or f"Node_{number}", matrix, mesh, tuple(node.children or ()))
+    camera = -1 if node.camera is None else int(node.camera)
+    light = int((node.extensions or {}).get(EXTENSION, {}).get("light", -1))
+    return Node(node.name or f"Node_{number}", matrix, mesh, tuple(node.children or ()), camera, light)

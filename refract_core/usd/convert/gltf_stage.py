@@ -1,4 +1,5 @@
-"""A glTF file as a USD stage: node hierarchy, meshes, UsdPreviewSurface materials with their pictures."""
+"""A glTF file as a USD stage: node hierarchy, meshes, UsdPreviewSurface materials with their pictures, lights,
+cameras."""
 
 from __future__ import annotations
 
@@ -18,6 +19,7 @@ from ..values import free_name
 from .author import Work, origin
 from .find import Glass
 from .gltf_file import Gltf, GltfMaterial, Picture, Primitive, read_gltf
+from .gltf_lamps import define_lamp, define_view
 
 _TYPES = Sdf.ValueTypeNames
 _DEEPEST = 256
@@ -112,6 +114,14 @@ def _node(
             used.add(label)
             _mesh(stage, path.AppendChild(label), primitive, gltf, materials)
             scales[primitive.material].append(abs(float(np.linalg.det(world[:3, :3]))) ** (1.0 / 3.0))
+    for which, name in ((node.camera, "Camera"), (node.light, "Light")):
+        if which >= 0:
+            label = free_name(name, used)
+            used.add(label)
+            if name == "Camera":
+                define_view(stage, path.AppendChild(label), gltf.cameras[which])
+            else:
+                define_lamp(stage, path.AppendChild(label), gltf.lights[which])
     for label, child in zip(_names([gltf.nodes[n].name for n in node.children], used), node.children, strict=True):
         _node(stage, path.AppendChild(label), child, gltf, materials, world, scales, depth + 1)
 

@@ -1,9 +1,9 @@
 """A stage as one glTF 2.0 file: what is drawn, in metres and Y up, with the KHR extensions that make glass.
 
-Only the core and KHR_materials_transmission, _volume, _ior, _dispersion, _clearcoat and _emissive_strength (Khronos
-glTF 2.0 and its registry). Every prim is a node that turns and moves; its scale and shear go into its points, so that
-thickness and attenuation distance, which glTF has in mesh space, are metres on all of them. Prims of one shape and
-scale share their mesh.
+Only the core, KHR_lights_punctual and KHR_materials_transmission, _volume, _ior, _dispersion, _clearcoat and
+_emissive_strength (Khronos glTF 2.0 and its registry). Every prim is a node that turns and moves; its scale and shear
+go into its points, so that thickness and attenuation distance, which glTF has in mesh space, are metres on all of them.
+Prims of one shape and scale share their mesh.
 """
 
 from __future__ import annotations
@@ -18,18 +18,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Usd, UsdGeom, UsdLux
+from pxr import Usd, UsdGeom
 
 from ...scene import F32, F64, Material, Notice, Param
 from ...version import __version__
 from ...world.solid import mean_way
+from ..camera import read_cameras
 from ..geometry.parts import Part, Tables, assemble, bind
 from ..geometry.primvars import spread
 from ..geometry.shapes import read_shape
 from ..geometry.triangulate import turned_over
+from ..lights.read import read_lights
 from ..stage import stage_unit, time_range
 from .author import Written
 from .find import original
+from .gltf_lamps import EXTENSION, camera_object, lamp_of, light_object, lost_of, lost_of_camera, shift_of, unwritten
 from .gltf_materials import Maker, Uv, uvs_of
 from .uses import drawn
 
@@ -49,6 +52,8 @@ class Document:
     accessors: list[dict[str, Any]] = field(default_factory=list)
     meshes: list[dict[str, Any]] = field(default_factory=list)
     nodes: list[dict[str, Any]] = field(default_factory=list)
+    cameras: list[dict[str, Any]] = field(default_factory=list)
+    lights: list[dict[str, Any]] = field(default_factory=list)
 
     def view(self, content: bytes, target: int | None = None) -> int:
         """A new buffer view, on a boundary of four bytes."""
@@ -93,7 +98,8 @@ def write_gltf(stage: Usd.Stage, out: str) -> Written:
     notices: list[Notice] = []
     time, unit = Usd.TimeCode(time_range(stage)[0]), stage_unit(stage, [])
     tables = Tables(time, unit, notices)
-    placed = list(_placed(stage, tables, _upright(stage) @ np.diag([unit] * 3 + [1.0])))
+    metres_from_stage = _upright(stage) @ np.diag([unit] * 3 + [1.0])
+    placed = list(_placed(stage, tables, metres_from_stage))
     document = Document()
     maker = Maker(document.view, list(tables.textures.values()), _ways(placed, tables.materials))
     open_ones = {int(n) for one in placed for n in np.unique(one.part.materials)
@@ -105,11 +111,12 @@ def write_gltf(stage: Usd.Stage, out: str) -> Written:
         key = id(one.part), np.round(one.stretch, 9).tobytes()
         if key not in meshes:
             meshes[key] = _mesh(document, maker, one, tables.materials, open_ones)
-        _node(document, nodes, roots, one, meshes[key])
+        motion = _motion(one.origin, one.turn)
+        _node(document, nodes, roots, one.path, motion | {"mesh": meshes[key]})
+    for path, content in _seen_by(stage, time, unit, metres_from_stage, document, notices):
+        _node(document, nodes, roots, path, content)
     if not placed:
         notices.append(Notice(out, "nothing of the stage is drawn, so there is nothing in the glTF file"))
-    if any(prim.HasAPI(UsdLux.LightAPI) or prim.IsA(UsdGeom.Camera) for prim in stage.Traverse()):
-        notices.append(Notice(out, "lights and cameras are not written to a glTF file"))
     content = _file(document, maker, roots, text=os.path.splitext(out)[1].lower() == ".gltf")
     return Written(content, tuple(dict.fromkeys(notices)), maker.told())
 
@@ -253,32 +260,56 @@ def _primitive(document: Document, corners: dict[str, F32]) -> dict[str, Any]:
 # --- nodes --------------------------------------------------------------------------------------------------------
 
 
-def _node(document: Document, nodes: dict[str, int], roots: list[int], one: _Placed, mesh: int) -> None:
-    """The prim's node, and one without a transform for each prim above it that there is none for yet."""
+def _seen_by(
+    stage: Usd.Stage, time: Usd.TimeCode, unit: float, metres_from_stage: F64, document: Document,
+    notices: list[Notice],
+) -> Iterator[tuple[str, dict[str, Any]]]:  # fmt: skip
+    """Paths and nodes of lights and cameras, whose entries go into the document; what is lost of them is told."""
+    frame: dict[str, Any] = {"engine_from_stage": metres_from_stage, "metres_per_unit": unit, "notices": notices}
+    lights, _ = read_lights(stage, time, purposes=_PURPOSES, **frame)
+    for light in lights:
+        document.lights.append(light_object(lamp_of(light), light.path.rpartition("/")[2]))
+        motion = _motion(light.world_from_light[:3, 3], light.world_from_light[:3, :3])
+        yield light.path, motion | {"extensions": {EXTENSION: {"light": len(document.lights) - 1}}}
+        if lost := list(lost_of(light)):
+            notices.append(Notice(light.path, f"glTF's lights have no {', '.join(lost)}: left out"))
+    notices.extend(unwritten(stage, {light.path for light in lights}))
+    for camera in read_cameras(stage, time, **frame):
+        document.cameras.append(camera_object(camera, camera.path.rpartition("/")[2]))
+        turn, origin = camera.world_from_camera[:3, :3], camera.world_from_camera[:3, 3]
+        if camera.orthographic:
+            origin = origin + turn @ shift_of(camera)
+        yield camera.path, _motion(origin, turn) | {"camera": len(document.cameras) - 1}
+        if lost := list(lost_of_camera(camera)):
+            notices.append(Notice(camera.path, f"glTF's cameras have no {', '.join(lost)}: left out"))
+
+
+def _node(document: Document, nodes: dict[str, int], roots: list[int], path: str, content: dict[str, Any]) -> None:
+    """A prim's node, and one without a transform for each prim above it that there is none for yet."""
     parent = -1
-    parts = one.path.strip("/").split("/")
+    parts = path.strip("/").split("/")
     for depth, name in enumerate(parts):
         last = depth == len(parts) - 1
-        path = "/".join(parts[: depth + 1])
-        if path not in nodes or last:
-            document.nodes.append({"name": name} | (_motion(one) | {"mesh": mesh} if last else {}))
+        here = "/".join(parts[: depth + 1])
+        if here not in nodes or last:
+            document.nodes.append({"name": name} | (content if last else {}))
             number = len(document.nodes) - 1
             if parent < 0:
                 roots.append(number)
             else:
                 document.nodes[parent].setdefault("children", []).append(number)
             if not last:
-                nodes[path] = number
-        parent = nodes.get(path, parent)
+                nodes[here] = number
+        parent = nodes.get(here, parent)
 
 
-def _motion(one: _Placed) -> dict[str, Any]:
+def _motion(origin: F64, turn: F64) -> dict[str, Any]:
     """Translation and rotation, where there are any."""
     found: dict[str, Any] = {}
-    if one.origin.any():
-        found["translation"] = one.origin.tolist()
-    if not np.allclose(one.turn, np.eye(3), atol=1e-12):
-        found["rotation"] = quaternion(one.turn).tolist()
+    if origin.any():
+        found["translation"] = origin.tolist()
+    if not np.allclose(turn, np.eye(3), atol=1e-12):
+        found["rotation"] = quaternion(turn).tolist()
     return found
 
 
@@ -304,7 +335,8 @@ def _file(document: Document, maker: Maker, roots: list[int], *, text: bool) -> 
     blob = bytes(document.blob)
     uri = {"uri": "data:application/octet-stream;base64," + base64.b64encode(blob).decode()} if text else {}
     parts = {
-        "nodes": document.nodes, "meshes": document.meshes, "accessors": document.accessors,
+        "nodes": document.nodes, "cameras": document.cameras, "meshes": document.meshes,
+        "accessors": document.accessors,
         "bufferViews": document.views, "buffers": [{"byteLength": len(blob)} | uri] if blob else [],
         **maker.parts(),
     }  # fmt: skip
@@ -313,6 +345,9 @@ def _file(document: Document, maker: Maker, roots: list[int], *, text: bool) -> 
         "asset": {"version": "2.0", "generator": f"refract {__version__}"}, "scene": 0, "scenes": [scene],
         **{name: values for name, values in parts.items() if values},
     }  # fmt: skip
+    if document.lights:
+        content["extensions"] = {EXTENSION: {"lights": document.lights}}
+        content["extensionsUsed"] = sorted({EXTENSION, *content.get("extensionsUsed", ())})
     document_text = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
     if text:
         return document_text
