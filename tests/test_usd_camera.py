@@ -332,6 +332,53 @@ def test_a_saved_view_that_makes_no_sense_is_passed_over(broken: tuple[str, str]
     assert any("frames everything" in notice.text for notice in scene.notices)
 
 
+ORTHOGRAPHIC = """customLayerData = {
+    dictionary cameraSettings = {
+        dictionary Front = {
+            double3 position = FRONT
+            double radius = 8
+        }
+        dictionary Perspective = {
+            double3 position = (3, 4, 5)
+            double3 target = (1, 1, 1)
+        }
+        dictionary Right = {
+            double3 position = RIGHT
+            double radius = 6
+        }
+        dictionary Top = {
+            double3 position = TOP
+            double radius = 4
+        }
+        string boundCamera = "/OmniverseKit_BOUND"
+    }
+}"""
+
+
+@pytest.mark.parametrize("up", ["Y", "Z"])
+@pytest.mark.parametrize(("bound", "width"), [("Front", 8.0), ("Right", 6.0), ("Top", 4.0)])
+def test_a_stage_saved_in_a_parallel_view_is_seen_in_it(up: str, bound: str, width: float) -> None:
+    """The places that Kit writes for new stages, the front one moved aside."""
+    places = ("(0.5, 1, 90)", "(-90, 0, 0)", "(0, 90, 0)")
+    if up == "Z":
+        places = ("(90, 0.5, 1)", "(0, -90, 0)", "(0, 0, 90)")
+    head = ORTHOGRAPHIC.replace("BOUND", bound)
+    for name, place in zip(("FRONT", "RIGHT", "TOP"), places, strict=True):
+        head = head.replace(name, place)
+    scene = read(CUBE(), up=up, head=head)
+    (camera,) = scene.cameras
+    assert camera.orthographic
+    start, along = ray(scene, camera, 0.0, 0.0)
+    wanted = {"Front": places[0], "Right": places[1], "Top": places[2]}[bound]
+    stands = np.array([float(number) for number in wanted.strip("()").split(",")])
+    axis = int(np.abs(stands).argmax())
+    assert along == pytest.approx(-np.sign(stands[axis]) * np.eye(3)[axis], abs=1e-6)
+    across = np.delete(np.asarray(start) - stands, axis)
+    assert across == pytest.approx((0.0, 0.0), abs=1e-5)
+    assert camera.window[1] - camera.window[0] == pytest.approx(width)
+    assert any("the view it was saved with" in notice.text for notice in scene.notices)
+
+
 def test_the_camera_that_a_stage_was_saved_with_comes_before_the_first() -> None:
     scene = read(SEVERAL, head=SAVED.replace("/OmniverseKit_Persp", "/b"))
     assert scene.cameras[0].path == "/b"

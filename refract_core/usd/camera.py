@@ -17,6 +17,10 @@ from .values import numbers
 MAIN_CAMERA = "main_cam"
 _TENTH = 0.1
 """Scene units of what a UsdGeomCamera's lens and film are measured in."""
+_SAVED_CAMERAS = "/OmniverseKit_"
+"""How the names of Omniverse's own cameras begin, which it does not save as prims."""
+_SAVED_AXES = {"Front": 2, "Right": 0, "Top": 1}
+"""Along which those look that are orthographic, where Y is up; where Z is, all are turned on by one."""
 _SAVED_FOCAL_LENGTH = 18.147562
 """Of the view that Omniverse's applications open a stage with, over the same aperture."""
 
@@ -213,7 +217,10 @@ def _saved_with(stage: Usd.Stage) -> dict[str, Any]:
 def _saved_view(
     stage: Usd.Stage, bounds: Bounds, engine_from_stage: F64, metres_per_unit: float, notices: list[Notice]
 ) -> Camera | None:
-    """The perspective view of a viewport that a stage was saved from; None where it says nothing of use."""
+    """The view of a viewport that a stage was saved from; None where it says nothing of use."""
+    parallel = _parallel_view(stage, bounds, engine_from_stage, metres_per_unit)
+    if parallel is not None:
+        return parallel
     view = _saved_with(stage).get("Perspective")
     if not isinstance(view, dict):
         return None
@@ -229,6 +236,32 @@ def _saved_view(
     reach = max(1.0e3 * distance, float(np.linalg.norm(np.abs(bounds).max(axis=0) + np.abs(here))))
     clipping = distance * 1.0e-3, 2.0 * reach
     return Camera("", _looking(here, there - here), (-right, right, -top, top), clipping=clipping)
+
+
+def _parallel_view(stage: Usd.Stage, bounds: Bounds, engine_from_stage: F64, metres_per_unit: float) -> Camera | None:
+    """The view from the front, the right or the top that a stage was saved in; None where it was saved in none.
+
+    Their axes are those of the applications: the front is +Z where Y is up and +X where Z is. A view looks back along
+    its axis from where it stands, and is `radius` wide.
+    """
+    saved = _saved_with(stage)
+    name = str(saved.get("boundCamera", "")).removeprefix(_SAVED_CAMERAS)
+    view = saved.get(name)
+    if name not in _SAVED_AXES or not isinstance(view, dict):
+        return None
+    place, radius = numbers(view.get("position")), view.get("radius")
+    if not place or len(place) != 3 or not np.isfinite(place).all() or not isinstance(radius, float | int):
+        return None
+    axis = _SAVED_AXES[name] if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y else (_SAVED_AXES[name] + 1) % 3
+    if not 0.0 < radius < math.inf or place[axis] == 0.0:
+        return None
+    along = -np.sign(place[axis]) * np.eye(3)[axis]
+    eye = engine_from_stage[:3, :3] @ np.array(place) + engine_from_stage[:3, 3]
+    reach = float(np.linalg.norm(np.abs(bounds).max(axis=0) + np.abs(eye)))
+    right = radius * metres_per_unit / 2.0
+    top = right * APERTURE[1] / APERTURE[0]
+    pose = _looking(eye, engine_from_stage[:3, :3] @ along)
+    return Camera("", pose, (-right, right, -top, top), orthographic=True, clipping=(-2.0 * reach, 2.0 * reach))
 
 
 def _looking(eye: F64, along: F64) -> F64:

@@ -17,6 +17,7 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdLux
 from ..errors import StageError, UsageError
 from ..scene import F64, Balls, Mesh, Notice, Scene, Sphere, prim_of
 from ..settings import AS_IT_IS, Opening
+from ..world.solid import areas
 from .camera import choose_camera, read_cameras
 from .diagnostics import captured, opened, words_of
 from .geometry.cages import FINENESS
@@ -31,7 +32,8 @@ from .geometry.skel import posed
 from .geometry.traverse import POINTS, Placement, refuse_too_many, some_of, told_of, walk
 from .geometry.ways import with_ways
 from .layers import mtlx
-from .lights.meshes import glowing, mesh_lights
+from .lights.context import Context
+from .lights.meshes import glow_of, glowing, mesh_lights, own_glows
 from .lights.read import read_lights
 from .opening import mask_of, open_as
 from .ours import recognised
@@ -250,7 +252,10 @@ def _read(
         extent = -np.ones(3), np.ones(3)
     centre = _origin(*extent)
     meshes, spheres = _drawn(placed, centre)
-    meshes = glowing(stage, time, meshes, tables.materials, metres_per_unit=metres_per_unit, notices=notices)
+    many = {str(placement.prim.GetPath()) for placement in drawn if placement.instance is not None}
+    meshes = glowing(
+        stage, time, meshes, tables.materials, metres_per_unit=metres_per_unit, notices=notices, instanced=many
+    )
     bodies = Bodies()
     instances = tuple(bodies.instances(groups.pop(0), centre) for _ in range(len(groups)))
     balls = tuple(to_balls(cloud, centre) for cloud in clouds)
@@ -360,6 +365,7 @@ def _placed(
     tables.notices.extend(_turned(prims, parts))
     proxies = any(placement.prim.IsInstanceProxy() for placement in placements)
     own = mesh_lights(stage) if proxies else frozenset()
+    _glow_in_many_places(stage, placements, parts, metres_from_stage, tables)
     solid = [placement for placement in placements if placement.prim.GetTypeName() != POINTS]
     alone, groups, clouds = shared(solid, parts, own, metres_from_stage, tables)
     for placement in placements:
@@ -376,6 +382,26 @@ def _placed(
         if item is not None:
             placed.append(item)
     return placed, groups, clouds
+
+
+def _glow_in_many_places(
+    stage: Usd.Stage, placements: list[Placement], parts: dict[Sdf.Path, Part | None], metres_from_stage: F64,
+    tables: Tables,
+) -> None:  # fmt: skip
+    """Gives the meshes of point instancers that are lights their glow; it is one, whatever the scale of each place."""
+    instanced = {placement.prim.GetPath(): placement for placement in reversed(placements) if placement.instance}
+    lights = own_glows(stage) if instanced else {}
+    context = Context(tables.time, UsdGeom.XformCache(tables.time), np.eye(4), tables.metres_per_unit, tables.notices)
+    for path, placement in instanced.items():
+        part, light = parts.get(path), lights.get(str(path))
+        if part is None or light is None:
+            continue
+        matrix = (metres_from_stage[:3, :3] @ placement.worlds[0][:, :3]) @ part.shape.prim_from_shape[:3, :3]
+        corners = (part.shape.points.astype(np.float64) @ matrix.T)[part.shape.triangles]
+        if (glow := glow_of(context, light, float(areas(corners).sum()))) is not None:
+            tables.materials.append(glow)
+            number = np.full(len(part.shape.triangles), len(tables.materials) - 1, np.int32)
+            parts[path] = part._replace(materials=number)
 
 
 def _coarse(parts: dict[Sdf.Path, Part | None], asked: Fineness, used: Fineness) -> Iterator[Notice]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -28,33 +28,43 @@ def is_mesh_light(prim: Usd.Prim) -> bool:
 
 def mesh_lights(stage: Usd.Stage) -> frozenset[str]:
     """Paths of the meshes that some light is about."""
-    every = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
-    return frozenset(str(path) for prim in every if is_mesh_light(prim) for path in _targets(prim))
+    return frozenset(str(path) for light in _every(stage) for path in _targets(light))
 
 
-def glowing(
-    stage: Usd.Stage, time: Usd.TimeCode, meshes: tuple[Mesh, ...], materials: list[Material],
-    *, metres_per_unit: float, notices: list[Notice],
-) -> tuple[Mesh, ...]:  # fmt: skip
-    """The meshes, of which those that are lights have a material of their own, added to `materials`.
+def own_glows(stage: Usd.Stage) -> dict[str, Usd.Prim]:
+    """Lights by the paths of the meshes that glow as they say.
 
     What `light:materialSyncMode` leaves to the bound material shows that: its own glow, whatever the light says. A mesh
     without material has nothing to tint, so it glows as the light says.
     """
+    return {
+        str(path): light for light in _every(stage) for path in _targets(light)
+        if _own_glow(stage.GetPrimAtPath(path), light)
+    }  # fmt: skip
+
+
+def glowing(
+    stage: Usd.Stage, time: Usd.TimeCode, meshes: tuple[Mesh, ...], materials: list[Material],
+    *, metres_per_unit: float, notices: list[Notice], instanced: Collection[str] = (),
+) -> tuple[Mesh, ...]:  # fmt: skip
+    """The meshes, of which those that are lights have a material of their own, added to `materials`.
+
+    Args:
+        instanced: paths of the prims that point instancers draw, which may be none of `meshes`
+    """
     context = Context(time, UsdGeom.XformCache(time), np.eye(4), metres_per_unit, notices)
-    lights: dict[str, Usd.Prim] = {}
-    drawn = {prim_of(mesh.path) for mesh in meshes}
-    for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
-        if is_mesh_light(prim):
-            targets = _targets(prim)
-            if not any(str(path) in drawn for path in targets):
-                note(context, prim, f"{prim.GetTypeName()} has no mesh that is drawn, so it gives no light")
-            for path in targets:
-                if _own_glow(stage.GetPrimAtPath(path), prim):
-                    lights[str(path)] = prim
+    drawn = {prim_of(mesh.path) for mesh in meshes} | set(instanced)
+    for light in _every(stage):
+        if not any(str(path) in drawn for path in _targets(light)):
+            note(context, light, f"{light.GetTypeName()} has no mesh that is drawn, so it gives no light")
+    lights = own_glows(stage)
     if not lights:
         return meshes
     return tuple(_lit(context, mesh, lights.get(prim_of(mesh.path)), materials) for mesh in meshes)
+
+
+def _every(stage: Usd.Stage) -> Iterator[Usd.Prim]:
+    return filter(is_mesh_light, Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
 
 
 def _targets(prim: Usd.Prim) -> Sequence[Sdf.Path]:
@@ -73,21 +83,30 @@ def _own_glow(mesh: Usd.Prim, light: Usd.Prim) -> bool:
 
 
 def _lit(context: Context, mesh: Mesh, light: Usd.Prim | None, materials: list[Material]) -> Mesh:
-    found = emission(context, UsdLux.LightAPI(light)) if light is not None else None
-    if light is None or found is None or not len(mesh.triangles):
+    if light is None or not len(mesh.triangles):
         return mesh
-    area = float(areas(mesh.points.astype(np.float64)[mesh.triangles]).sum())
+    made = glow_of(context, light, float(areas(mesh.points.astype(np.float64)[mesh.triangles]).sum()))
+    if made is None:
+        return mesh
+    materials.append(made)
+    return replace(mesh, materials=np.full(len(mesh.triangles), len(materials) - 1, np.int32))
+
+
+def glow_of(context: Context, light: Usd.Prim, area: float) -> Material | None:
+    """What a mesh of an area [m^2] looks like that glows as a light says; None, with a notice, where it does not."""
+    found = emission(context, UsdLux.LightAPI(light))
+    if found is None:
+        return None
     factor = 1.0
     if value(context, light, "inputs:normalize", False):
         if area <= 0.0:
             note(context, light, "has no area, so it gives no light; it is drawn without")
-            return mesh
+            return None
         factor = context.metres_per_unit**2 / area
     r, g, b_ = (channel * factor for channel in found)
     inputs = {param: Source(_four(_BLACK.get(param, (0.0,)))) for param in Param}
     inputs[Param.EMISSIVE] = Source((r, g, b_, 1.0))
-    materials.append(Material(str(light.GetPath()), tuple(inputs[param] for param in Param)))
-    return replace(mesh, materials=np.full(len(mesh.triangles), len(materials) - 1, np.int32))
+    return Material(str(light.GetPath()), tuple(inputs[param] for param in Param))
 
 
 def _four(values: tuple[float, ...]) -> tuple[float, float, float, float]:

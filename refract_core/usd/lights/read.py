@@ -330,5 +330,5 @@ def _ignored_on_domes(context: Context, prim: Usd.Prim) -> list[str]:
 def _note_instanced(prim: Usd.Prim, notices: list[Notice]) -> None:
     """Lights among a point instancer's prototypes are not multiplied."""
     inside = Usd.PrimRange(prim, Usd.TraverseInstanceProxies())
-    if any(child.HasAPI(UsdLux.LightAPI) for child in inside if child != prim):
-        notices.append(Notice(str(prim.GetPath()), "lights inside a PointInstancer are ignored"))
+    if any(child.HasAPI(UsdLux.LightAPI) and not is_mesh_light(child) for child in inside if child != prim):
+        notices.append(Notice(str(prim.GetPath()), "lights inside a PointInstancer are ignored, but for mesh lights"))
