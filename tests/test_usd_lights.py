@@ -809,14 +809,14 @@ def test_a_bound_material_glows_by_itself_unless_the_light_says_otherwise() -> N
 def test_mesh_lights_of_a_point_instancer_glow_in_all_their_places(of: str, normalize: int) -> None:
     """As one that stands there by itself, twice as large: of an area of 6 x 4 in the stage's units."""
     inputs = f"float inputs:intensity = 48\nbool inputs:normalize = {normalize}"
-    mesh = f'def Mesh "L" {{ {SQUARE} }}'
+    mesh = f'def Mesh "L" {{\n{SQUARE}\n}}'
     if of == "MeshLightAPI":
-        mesh, light = f'def Mesh "L" (prepend apiSchemas = ["MeshLightAPI"]) {{ {SQUARE}\n{inputs} }}', ""
+        mesh, light = f'def Mesh "L" (prepend apiSchemas = ["MeshLightAPI"]) {{\n{SQUARE}\n{inputs}\n}}', ""
     else:
-        light = f'def GeometryLight "G" {{ {inputs}\nrel geometry = </P/Bulb/L>\n}}'
+        light = f'def GeometryLight "G" {{\n{inputs}\nrel geometry = </P/Bulb/L>\n}}'
     many = "int[] protoIndices = [0, 0]\npoint3f[] positions = [(0, 0, 0), (9, 0, 0)]\nfloat3[] scales = [(2, 2, 2), "
     many += "(2, 2, 2)]\nrel prototypes = </P/Bulb>"
-    found, said = emitted(f'def PointInstancer "P" {{ {many}\ndef Xform "Bulb" {{ {mesh} }}\n}}\n{light}')
+    found, said = emitted(f'def PointInstancer "P" {{\n{many}\ndef Xform "Bulb" {{\n{mesh}\n}}\n}}\n{light}')
     wanted = 48.0 / 24.0 if normalize else 48.0
     assert found == {f"/P/[{place}]/Bulb/L": pytest.approx((wanted,) * 3) for place in (0, 1)}
     assert not {"/P", "/G", "/P/Bulb/L"} & set(said)

@@ -32,7 +32,6 @@ from .geometry.skel import posed
 from .geometry.traverse import POINTS, Placement, refuse_too_many, some_of, told_of, walk
 from .geometry.ways import with_ways
 from .layers import mtlx
-from .lights.context import Context
 from .lights.meshes import glow_of, glowing, mesh_lights, own_glows
 from .lights.read import read_lights
 from .opening import mask_of, open_as
@@ -391,14 +390,14 @@ def _glow_in_many_places(
     """Gives the meshes of point instancers that are lights their glow; it is one, whatever the scale of each place."""
     instanced = {placement.prim.GetPath(): placement for placement in reversed(placements) if placement.instance}
     lights = own_glows(stage) if instanced else {}
-    context = Context(tables.time, UsdGeom.XformCache(tables.time), np.eye(4), tables.metres_per_unit, tables.notices)
+    how: dict[str, Any] = {"metres_per_unit": tables.metres_per_unit, "notices": tables.notices}
     for path, placement in instanced.items():
         part, light = parts.get(path), lights.get(str(path))
         if part is None or light is None:
             continue
         matrix = (metres_from_stage[:3, :3] @ placement.worlds[0][:, :3]) @ part.shape.prim_from_shape[:3, :3]
         corners = (part.shape.points.astype(np.float64) @ matrix.T)[part.shape.triangles]
-        if (glow := glow_of(context, light, float(areas(corners).sum()))) is not None:
+        if (glow := glow_of(light, float(areas(corners).sum()), tables.time, **how)) is not None:
             tables.materials.append(glow)
             number = np.full(len(part.shape.triangles), len(tables.materials) - 1, np.int32)
             parts[path] = part._replace(materials=number)

@@ -52,7 +52,7 @@ def glowing(
     Args:
         instanced: paths of the prims that point instancers draw, which may be none of `meshes`
     """
-    context = Context(time, UsdGeom.XformCache(time), np.eye(4), metres_per_unit, notices)
+    context = _context(time, metres_per_unit, notices)
     drawn = {prim_of(mesh.path) for mesh in meshes} | set(instanced)
     for light in _every(stage):
         if not any(str(path) in drawn for path in _targets(light)):
@@ -85,15 +85,25 @@ def _own_glow(mesh: Usd.Prim, light: Usd.Prim) -> bool:
 def _lit(context: Context, mesh: Mesh, light: Usd.Prim | None, materials: list[Material]) -> Mesh:
     if light is None or not len(mesh.triangles):
         return mesh
-    made = glow_of(context, light, float(areas(mesh.points.astype(np.float64)[mesh.triangles]).sum()))
+    made = _glow(context, light, float(areas(mesh.points.astype(np.float64)[mesh.triangles]).sum()))
     if made is None:
         return mesh
     materials.append(made)
     return replace(mesh, materials=np.full(len(mesh.triangles), len(materials) - 1, np.int32))
 
 
-def glow_of(context: Context, light: Usd.Prim, area: float) -> Material | None:
+def glow_of(
+    light: Usd.Prim, area: float, time: Usd.TimeCode, *, metres_per_unit: float, notices: list[Notice]
+) -> Material | None:
     """What a mesh of an area [m^2] looks like that glows as a light says; None, with a notice, where it does not."""
+    return _glow(_context(time, metres_per_unit, notices), light, area)
+
+
+def _context(time: Usd.TimeCode, metres_per_unit: float, notices: list[Notice]) -> Context:
+    return Context(time, UsdGeom.XformCache(time), np.eye(4), metres_per_unit, notices)
+
+
+def _glow(context: Context, light: Usd.Prim, area: float) -> Material | None:
     found = emission(context, UsdLux.LightAPI(light))
     if found is None:
         return None
