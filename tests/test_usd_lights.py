@@ -820,3 +820,41 @@ def test_mesh_lights_of_a_point_instancer_glow_in_all_their_places(of: str, norm
     wanted = 48.0 / 24.0 if normalize else 48.0
     assert found == {f"/P/[{place}]/Bulb/L": pytest.approx((wanted,) * 3) for place in (0, 1)}
     assert not {"/P", "/G", "/P/Bulb/L"} & set(said)
+
+
+LAMPS = """
+    int[] protoIndices = [0, 0, 0]
+    point3f[] positions = [(1, 0, 0), (2, 0, 0), (3, 0, 0)]
+    float3[] scales = [(1, 1, 1), (2, 2, 2), (1, 1, 1)]
+    rel prototypes = </P/Post>
+"""
+
+
+def lamps(kind: str, said: str = "", more: str = "") -> tuple[list[Light], list[str]]:
+    """Lights of a point instancer in places 1, 2 and 3, each 5 above it, and what was told."""
+    stage = Usd.Stage.CreateInMemory()
+    up = 'double3 xformOp:translate = (0, 5, 0)\nuniform token[] xformOpOrder = ["xformOp:translate"]'
+    light = f'def {kind} "L"\n{{\n{said}\n{up}\n}}'
+    text = f'def PointInstancer "P"\n{{\n{LAMPS}\n{more}\ndef Xform "Post"\n{{\n{light}\n}}\n}}'
+    stage.GetRootLayer().ImportFromString(f"#usda 1.0\n(\n    metersPerUnit = 1\n)\n{text}\n")
+    what = scene_from_stage(stage)
+    return list(what.lights), [f"{notice.path}: {notice.text}" for notice in what.notices]
+
+
+def test_lights_of_a_point_instancer_shine_in_all_their_places() -> None:
+    """As each would by itself: where its instance stands, and as large."""
+    found, _ = lamps("SphereLight", "float inputs:radius = 0.5\nfloat inputs:intensity = 7")
+    assert [light.path for light in found] == [f"/P/[{place}]/Post/L" for place in range(3)]
+    assert [light.size[0] for light in found] == pytest.approx([0.5, 1.0, 0.5])
+    assert {light.radiance for light in found} == {(7.0, 7.0, 7.0)}
+    places = np.array([light.world_from_light[:3, 3] for light in found])
+    np.testing.assert_allclose(places - places[0], [(0, 0, 0), (1, 5, 0), (2, 0, 0)], atol=1e-6)
+
+
+def test_what_is_not_there_of_a_point_instancer_does_not_shine() -> None:
+    found, _ = lamps("SphereLight", more="int64[] invisibleIds = [1]")
+    assert [light.path for light in found] == ["/P/[0]/Post/L", "/P/[2]/Post/L"]
+    assert not lamps("SphereLight", 'token visibility = "invisible"')[0]
+    found, said = lamps("DomeLight")
+    assert not found
+    assert any("/P/Post/L" in one and "sky" in one for one in said)

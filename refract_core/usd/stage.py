@@ -243,7 +243,9 @@ def _read(
     metres_per_unit = stage_unit(stage, notices)
     metres_from_stage = _upright(stage, notices) @ np.diag([metres_per_unit] * 3 + [1.0])
     tables = Tables(time, metres_per_unit, notices, FINENESS[complexity])
-    drawn = walk(stage, time, purposes, notices, draw_modes=True)
+    found = walk(stage, time, purposes, notices, as_drawn=True)
+    lamps = [placement for placement in found if not placement.prim.IsA(UsdGeom.Gprim)]
+    drawn = [placement for placement in found if placement.prim.IsA(UsdGeom.Gprim)]
     placed, groups, clouds = _placed(stage, keep(drawn, tables) if keep else drawn, metres_from_stage, tables)
     extent = _extent([bounds_of(placed), *map(bounds_of_group, groups), *map(bounds_of_cloud, clouds)])
     if extent is None:
@@ -275,7 +277,8 @@ def _read(
     every_path = [many.paths for many in instances] + [cloud.paths for cloud in balls]
     things += [owner for some in every_path for owner, _ in some.owners()]
     paths = tuple(dict.fromkeys(things))
-    lights, environment = read_lights(stage, time, purposes=purposes, drawn=paths, **frame)
+    lit_by = [(lamp.prim, lamp.run.path(row), lamp.worlds[row]) for lamp in lamps for row in range(len(lamp.worlds))]
+    lights, environment = read_lights(stage, time, purposes=purposes, drawn=paths, instanced=lit_by, **frame)
     every = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
     glow = {m for m, material in enumerate(tables.materials) if material.emits}
     used = {m for mesh in every_mesh for m in np.unique(mesh.materials).tolist()}

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux
 
 from ...errors import StageError
 from ...scene import F64, I32, Notice, Run
@@ -114,21 +114,25 @@ class _Walk:
     expanded: int = 0
     within: tuple[Sdf.Path, ...] = ()
     """Point instancers being expanded, outermost first."""
+    lights: bool = False
+    """Lights of point instancers are among what is found."""
 
 
 def walk(
-    stage: Usd.Stage, time: Usd.TimeCode, purposes: tuple[str, ...], notices: list[Notice], *, draw_modes: bool = False
-) -> list[Placement]:
+    stage: Usd.Stage, time: Usd.TimeCode, purposes: tuple[str, ...], notices: list[Notice],
+    *, as_drawn: bool = False,
+) -> list[Placement]:  # fmt: skip
     """Every visible prim with a surface, in the order of the stage.
 
     Args:
-        draw_modes: models are drawn as their `model:drawMode` asks; else as what they are made of
+        as_drawn: models are drawn as their `model:drawMode` asks, else as what they are made of; and the lights of
+            point instancers, which have no surface, are there, too
 
     Raises:
         StageError: where instances expand to more than `MAX_INSTANCES` or `MAX_PRIMS` prims.
     """
     state = _Walk(time, frozenset(purposes), notices, UsdGeom.XformCache(time))
-    state.stand_ins = StandIns(stage, notices) if draw_modes else None
+    state.stand_ins, state.lights = StandIns(stage, notices) if as_drawn else None, as_drawn
     start = _Node(stage.GetPseudoRoot(), Gf.Matrix4d(1.0), UsdGeom.Imageable.PurposeInfo(), True)
     found = list(_descend(state, start, Usd.TraverseInstanceProxies(), 0))
     for kind, paths in sorted(state.unsupported.items()):
@@ -214,6 +218,8 @@ def _descend(
                 yield Placement(prim, Run((label,), _ONE), np.array(here.world).T[None, :3], here.static)
             else:
                 state.unsupported.setdefault(kind, []).append(label)
+        elif state.lights and state.within and prim.HasAPI(UsdLux.LightAPI) and _wanted(state, here):
+            yield Placement(prim, Run((label,), _ONE), np.array(here.world).T[None, :3], here.static)
         children = prim.GetFilteredChildren(predicate)
         stack.extend(here._replace(prim=child) for child in reversed(children))
 

@@ -19,6 +19,8 @@ from .meshes import is_mesh_light
 from .shaping import is_linked, read_link, read_shadow, read_shaping
 
 _DOMES = ("DomeLight", "DomeLight_1")
+MOST_INSTANCED = 256
+"""Places where lights of point instancers shine: each costs every point of the picture what any light does."""
 
 
 class Shape(NamedTuple):
@@ -41,6 +43,7 @@ def read_lights(
     purposes: tuple[str, ...],
     notices: list[Notice],
     drawn: Sequence[str] = (),
+    instanced: Sequence[tuple[Usd.Prim, str, F64]] = (),
 ) -> tuple[tuple[Light, ...], Environment | None]:
     """Every visible light of the stage.
 
@@ -52,6 +55,7 @@ def read_lights(
         purposes: Purposes that are rendered.
         notices: What was ignored, replaced or guessed is added here.
         drawn: Paths of all prims that are drawn, which lights may be linked to.
+        instanced: Lights that point instancers put somewhere: prim, path, place of shape (3, 4) in the stage's world.
 
     Returns:
         Finite and distant lights in stage order, and all domes summed (None where there is none).
@@ -62,10 +66,19 @@ def read_lights(
     prims = iter(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
     for prim in prims:
         if prim.IsA(UsdGeom.PointInstancer):
-            _note_instanced(prim, notices)
             prims.PruneChildren()
         elif prim.HasAPI(UsdLux.LightAPI) and _shown(prim, time, purposes):
-            _read_light(context, prim, lights, domes, drawn)
+            world = np.array(context.xforms.GetLocalToWorldTransform(prim), np.float64).T
+            _read_light(context, prim, str(prim.GetPath()), world, lights, domes, drawn)
+    for prim, path, place in instanced[:MOST_INSTANCED]:
+        if prim.GetTypeName() in _DOMES:
+            note(context, prim, "a sky inside a PointInstancer is ignored: it is the same from everywhere")
+            continue
+        world = np.vstack([place, (0.0, 0.0, 0.0, 1.0)])
+        _read_light(context, prim, path, world, lights, domes, drawn)
+    if len(instanced) > MOST_INSTANCED:
+        text = f"point instancers put lights in {len(instanced)} places; the first {MOST_INSTANCED} shine"
+        notices.append(Notice(instanced[MOST_INSTANCED][1], text))
     return tuple(_few_casters(lights, notices)), sum_domes(domes)
 
 
@@ -81,8 +94,9 @@ def _few_casters(lights: list[Light], notices: list[Notice]) -> list[Light]:
 
 
 def _read_light(
-    context: Context, prim: Usd.Prim, lights: list[Light], domes: list[Dome], drawn: Sequence[str]
-) -> None:
+    context: Context, prim: Usd.Prim, path: str, world: F64, lights: list[Light], domes: list[Dome],
+    drawn: Sequence[str],
+) -> None:  # fmt: skip
     """Add one light prim to `lights` or `domes`, or a notice."""
     name = str(prim.GetTypeName())
     if name not in ROWS and name not in _DOMES:
@@ -97,7 +111,7 @@ def _read_light(
     if shining is None:
         return
     _note_ignored(context, prim)
-    world_from_light = context.engine_from_stage @ np.array(context.xforms.GetLocalToWorldTransform(prim), np.float64).T
+    world_from_light = context.engine_from_stage @ world
     if not np.isfinite(world_from_light).all():
         note(context, prim, "has a transform with NaN or infinity; the light is skipped; repair its xformOps")
         return
@@ -115,7 +129,7 @@ def _read_light(
     casts_shadow, shadow = read_shadow(context, prim)
     lights.append(
         Light(
-            path=str(prim.GetPath()),
+            path=path,
             kind=row.kind,
             radiance=(r, g, b),
             world_from_light=shape.world_from_light,
@@ -325,10 +339,3 @@ def _ignored_on_domes(context: Context, prim: Usd.Prim) -> list[str]:
         if float(value(context, prim, name, 1.0)) != 1.0:
             found.append(name)
     return found
-
-
-def _note_instanced(prim: Usd.Prim, notices: list[Notice]) -> None:
-    """Lights among a point instancer's prototypes are not multiplied."""
-    inside = Usd.PrimRange(prim, Usd.TraverseInstanceProxies())
-    if any(child.HasAPI(UsdLux.LightAPI) and not is_mesh_light(child) for child in inside if child != prim):
-        notices.append(Notice(str(prim.GetPath()), "lights inside a PointInstancer are ignored, but for mesh lights"))
