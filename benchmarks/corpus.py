@@ -67,9 +67,10 @@ CAUSES = (
     Cause("light", r"\b\w*Light\w* is not|light.*(ignored|skipped|not drawn)|lightFilter|portal"),
     Cause("no light", r"no light"),
     Cause("no camera", r"has no camera"),
-    Cause("depth of field", r"depth of field|fStop"),
+    Cause("depth of field", r"depth of field|fStop|out of focus"),
+    Cause("exposure", r"far above white"),
     Cause("motion blur", r"shutter|motion"),
-    Cause("draw mode", r"drawMode is"),
+    Cause("draw mode", r"drawMode"),
     Cause("subset", r"of its indices are ignored|elementType"),
     Cause("value out of range", r"it is clamped|it must be"),
     Cause("tint without a depth", r"transmission colou?r without a depth"),
@@ -83,8 +84,11 @@ CAUSES = (
     Cause(_UNSEEN, r"^no pixel of the picture shows anything"),
     Cause("render settings", r"is authored but not used|renderSettingsPrimPath|RenderProduct|RenderVar"),
 )
-NO_MISTAKE = {"no camera", "no light", "empty", "binding without its schema"}
-"""Said of a stage that lacks something, and is drawn as well as it can be."""
+NO_MISTAKE = {
+    "no camera", "no light", "empty", "binding without its schema", "draw mode", "depth of field", "motion blur",
+    "exposure",
+}  # fmt: skip
+"""Said of a stage that lacks something, or asks for something, and is drawn as well as it can be."""
 
 
 def stages_in(folder: Path) -> list[Path]:
@@ -161,9 +165,10 @@ def draw(stage: str, out: str, width: int) -> dict[str, Any]:
         authored = read_settings(opened, "", notices)
         small = {"image_width": width, "image_height": 0, "jobs": 1}
         settings = RenderSettings(**{**authored, **QUALITIES["good"], **small})
-        scene = scene_from_stage(opened, purposes=settings.purposes, camera=settings.camera)
+        how: dict[str, Any] = {"purposes": settings.purposes, "camera": settings.camera}
+        scene = scene_from_stage(opened, **how)
         read = time.perf_counter()
-        frame = render(scene, settings)
+        frame = render(scene, settings, scene_at=lambda code: scene_from_stage(opened, time_code=code, **how))
     frame.save(out)
     notices += [*scene.notices, *frame.notices]
     return {

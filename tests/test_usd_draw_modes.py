@@ -205,7 +205,7 @@ def test_a_picture_that_is_not_there_leaves_the_draw_mode_colour(tmp_path: Path)
     scene = read(model(text))
     material = scene.materials[int(scene.meshes[0].materials[0])]
     assert tuple(material.inputs[0].value[:3]) == pytest.approx((0.9, 0.1, 0.2))
-    assert any("none.png" in notice.text for notice in scene.notices)
+    assert "none.png" in texts(scene, "/Model/cardTextureXPos/Texture")
 
 
 def test_cards_from_textures_lie_where_the_screen_was(tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ from .geometry.place import Placed, bounds_of, place, to_mesh, to_sphere
 from .geometry.refined import MOST_TRIANGLES, Fineness
 from .geometry.shapes import INWARDS, TURN, Shape, read_shape
 from .geometry.skel import posed
+from .geometry.standins import ROOT
 from .geometry.traverse import POINTS, Placement, refuse_too_many, some_of, told_of, walk
 from .geometry.ways import with_ways
 from .layers import mtlx
@@ -184,7 +185,8 @@ def scene_from_stage(
             reason = words_of(error.args[0])
             raise StageError(f"{stage.GetRootLayer().identifier}: USD cannot read it: {reason}") from error
     notices.extend(_said(heard, scene.name))
-    return replace(scene, notices=tuple(_grouped(dict.fromkeys(notices))))
+    named = (replace(notice, path=notice.path.removeprefix(ROOT)) for notice in notices)
+    return replace(scene, notices=tuple(_grouped(dict.fromkeys(named))))
 
 
 def _said(heard: list[str], name: str) -> Iterator[Notice]:

@@ -2,5 +2,5 @@
 
 __all__ = [
     "cages", "curves", "dots", "many", "moving", "parts", "place", "primvars", "refined", "shapes", "skel",
-    "traverse", "triangulate", "ways",
+    "standins", "traverse", "triangulate", "ways",
 ]  # fmt: skip

@@ -21,7 +21,8 @@ CARDS, BOUNDS, ORIGIN = "cards", "bounds", "origin"
 MODES = (CARDS, BOUNDS, ORIGIN)
 INHERITED = UsdGeom.Tokens.inherited
 _PROJECTED = UsdGeom.Tokens.fromTexture
-_ROOT = "/refract_draw_modes"
+ROOT = "/refract_draw_modes"
+"""Of their stage; below it they have the paths of the first models that asked for them."""
 _FACES = ("XPos", "YPos", "ZPos", "XNeg", "YNeg", "ZNeg")
 _PURPOSES = [UsdGeom.Tokens.default_, UsdGeom.Tokens.proxy, UsdGeom.Tokens.render]
 _THRESHOLD = 0.1
@@ -104,7 +105,7 @@ class StandIns:
         return self._made[asked]
 
     def _make(self, asked: _Asked, model: str) -> Usd.Prim | None:
-        path = f"{_ROOT}/M{len(self._made)}"
+        path = f"{ROOT}{model}"
         if asked.mode == ORIGIN:
             return self._lines(path, [(np.zeros(3), axis) for axis in np.eye(3)], _THIN, asked.color)
         low, high = np.array(asked.box[:3]), np.array(asked.box[3:])
@@ -163,7 +164,7 @@ class StandIns:
         for number, face in enumerate(quads):
             if (shown := _shown(face, pictures)) in pictures:
                 subset = UsdGeom.Subset.CreateGeomSubset(mesh, face, UsdGeom.Tokens.face, [number], "materialBind")
-                material = self._material(f"{path}/{shown}_", pictures[shown], color)
+                material = self._material(f"{path}/cardTexture{shown}", pictures[shown], color)
                 UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(material)
         return mesh.GetPrim()
 
