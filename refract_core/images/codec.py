@@ -197,11 +197,11 @@ def read_matrix(path: str, name: str, wanted: Sequence[str]) -> F64:
     if file is None:
         raise ImageError(f"{name}: not a readable image: {reason(oiio.geterror(), path)}")
     try:
-        attributes = {str(one.name).lower(): one.value for one in file.spec().extra_attribs}
+        attributes: dict[str, Any] = {str(one.name).lower(): one.value for one in file.spec().extra_attribs}
     finally:
         file.close()
     for known in wanted:
-        if np.shape(attributes.get(known)) == (16,):
+        if known in attributes and np.shape(attributes[known]) == (16,):
             return np.asarray(attributes[known], np.float64).reshape(4, 4)
     raise ImageError(f"{name}: its head has no matrix of 16 numbers named {' or '.join(wanted)}")
 
