@@ -147,7 +147,8 @@ def face_of(scene: Scene, axis: int, sign: int) -> tuple[F64, F64, int]:
     points = corners(scene, mesh)[mesh.triangles]
     span = np.abs(corners(scene, mesh)[:, axis]).max()
     (rows,) = np.nonzero(np.isclose(points[:, :, axis], sign * span, atol=1e-3).all(axis=1))
-    return points[rows].reshape(-1, 3), mesh.primvars["st"][rows].reshape(-1, 2), int(mesh.materials[rows[0]])
+    st = mesh.primvars["st"][rows].reshape(-1, 2).astype(np.float64)
+    return points[rows].reshape(-1, 3), st, int(mesh.materials[rows[0]])
 
 
 RIGHT = {(0, 1): (0, 1, 0), (0, -1): (0, -1, 0), (1, 1): (-1, 0, 0), (1, -1): (1, 0, 0), (2, 1): (1, 0, 0),

@@ -113,8 +113,8 @@ def write_gltf(stage: Usd.Stage, out: str) -> Written:
             meshes[key] = _mesh(document, maker, one, tables.materials, open_ones)
         motion = _motion(one.origin, one.turn)
         _node(document, nodes, roots, one.path, motion | {"mesh": meshes[key]})
-    for path, content in _seen_by(stage, time, unit, metres_from_stage, document, notices):
-        _node(document, nodes, roots, path, content)
+    for path, seen_by in _seen_by(stage, time, unit, metres_from_stage, document, notices):
+        _node(document, nodes, roots, path, seen_by)
     if not placed:
         notices.append(Notice(out, "nothing of the stage is drawn, so there is nothing in the glTF file"))
     content = _file(document, maker, roots, text=os.path.splitext(out)[1].lower() == ".gltf")
@@ -341,7 +341,7 @@ def _file(document: Document, maker: Maker, roots: list[int], *, text: bool) -> 
         **maker.parts(),
     }  # fmt: skip
     scene = {"nodes": roots} if roots else {}
-    content = {
+    content: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": f"refract {__version__}"}, "scene": 0, "scenes": [scene],
         **{name: values for name, values in parts.items() if values},
     }  # fmt: skip
