@@ -250,6 +250,12 @@ def test_many_instances_of_a_model_are_one_card(tmp_path: Path) -> None:
     assert not scene.meshes
 
 
+def test_lights_in_a_model_that_is_replaced_do_not_shine() -> None:
+    lamp = 'def SphereLight "Lamp" { }'
+    assert not read(model(CARDS, inside=BOX + lamp)).lights
+    assert read(model("", inside=BOX + lamp)).lights
+
+
 def test_the_callers_stage_is_not_changed() -> None:
     stage = Usd.Stage.CreateInMemory()
     stage.GetRootLayer().ImportFromString("#usda 1.0\n" + model(CARDS).replace("{", "{\n").replace("}", "\n}\n"))

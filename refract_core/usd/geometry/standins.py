@@ -57,11 +57,15 @@ def own_cards(prim: Usd.Prim, above: str) -> str:
 def takes(prim: Usd.Prim) -> bool:
     """Whether a draw mode takes effect at a prim: where `model:applyDrawMode` says so, and at components that are
     silent about it."""
-    model = Usd.ModelAPI(prim)
-    if not model.IsModel():
+    if not prim.IsModel() or prim.IsPseudoRoot():
         return False
     said = prim.GetAttribute("model:applyDrawMode")
-    return bool(said.Get()) if said and said.HasAuthoredValue() else model.IsKind("component")
+    return bool(said.Get()) if said and said.HasAuthoredValue() else prim.IsComponent()
+
+
+def is_replaced(prim: Usd.Prim) -> bool:
+    """Something stands for a prim and all that is below it."""
+    return takes(prim) and UsdGeom.ModelAPI(prim).ComputeModelDrawMode() in MODES
 
 
 class _Asked(NamedTuple):

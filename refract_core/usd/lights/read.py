@@ -12,6 +12,7 @@ from pxr import Usd, UsdGeom, UsdLux
 
 from ...scene import F64, Environment, Light, LightKind, Notice
 from ...world.embree import CASTER_SHIFTS
+from ..geometry.standins import is_replaced
 from .context import Context, note, number, value
 from .domes import Dome, read_dome, rotation, sum_domes
 from .emission import emission
@@ -65,7 +66,7 @@ def read_lights(
     domes: list[Dome] = []
     prims = iter(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
     for prim in prims:
-        if prim.IsA(UsdGeom.PointInstancer):
+        if prim.IsA(UsdGeom.PointInstancer) or is_replaced(prim):
             prims.PruneChildren()
         elif prim.HasAPI(UsdLux.LightAPI) and _shown(prim, time, purposes):
             world = np.array(context.xforms.GetLocalToWorldTransform(prim), np.float64).T
