@@ -68,7 +68,7 @@ CAUSES = (
     Cause("no light", r"no light"),
     Cause("no camera", r"has no camera"),
     Cause("depth of field", r"depth of field|fStop|out of focus"),
-    Cause("exposure", r"far above white"),
+    Cause("exposure", r"far above white|nearly black"),
     Cause("motion blur", r"shutter|motion"),
     Cause("draw mode", r"drawMode"),
     Cause("subset", r"of its indices are ignored|elementType"),

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scene_reading import read
 from scenes import box, camera, checker_room, draw, glass, light, material, quad, scene, shell, turned
 
 import refract_core as rc
@@ -306,3 +307,23 @@ def test_axis_unit_and_place_do_not_change_the_picture(
     # Lengths are in the stage's own units.
     seen = np.isfinite(plain["Z"]) & (difference < 1e-3)
     np.testing.assert_allclose(other["Z"][seen] * unit, plain["Z"][seen], rtol=1e-3)
+
+
+@pytest.mark.parametrize("intensity", [1e-3, 1e6])
+def test_a_picture_far_out_of_range_tells_the_exposure_that_shows_it(intensity: float) -> None:
+    """Taken at its word, there is something to see, and nothing more to say."""
+    sun = f'def DistantLight "L" {{ float inputs:intensity = {intensity}\nfloat inputs:angle = 0 }}'
+    ball = read(f'def Sphere "S" {{ }}\n{sun}')
+    settings = rc.RenderSettings(image_width=24, image_height=24, samples=1, studio="none")
+    (told,) = [notice.text for notice in rc.render(ball, settings).notices if "--exposure" in notice.text]
+    assert ("nearly black" in told) == (intensity < 1.0)
+    stops = float(told.partition("--exposure ")[2].split()[0])
+    shown = rc.render(ball, replace(settings, exposure=stops))
+    assert 0.05 < np.percentile(shown.planes["beauty"][..., :3].max(axis=-1), 95) < 3.0
+    assert not [notice for notice in shown.notices if "--exposure" in notice.text]
+
+
+def test_where_there_is_no_light_no_exposure_is_told() -> None:
+    ball = read('def Sphere "S" { }\ndef DistantLight "L" { float inputs:intensity = 0 }')
+    settings = rc.RenderSettings(image_width=24, image_height=24, samples=1, studio="none")
+    assert not [notice for notice in rc.render(ball, settings).notices if "--exposure" in notice.text]

@@ -255,21 +255,28 @@ def nothing_seen(scene: Scene, camera: Camera, planes: dict[str, NDArray[np.floa
     return (Notice(camera.path or "/", NOTHING_SEEN + text),)
 
 
-_WHITE, _GREY = 3.0, 0.4
-"""Light from which on half of a picture being there means that it shows nothing, and what its middle should be."""
+_WHITE, _GREY, _BLACK = 3.0, 0.4, 0.005
+"""Light over which half of a picture, or under which all but its brightest twentieth, shows nothing, and what that should
+be instead."""
 
 
 def out_of_range(
     camera: Camera, settings: RenderSettings, planes: dict[str, NDArray[np.float32]]
 ) -> tuple[Notice, ...]:
-    """Say that most of what is there is far above white, as of files that count lights in watts, and by how much."""
+    """Say that most of what is there is far above white, or nearly black, as of files that count lights in watts, and by
+    how much. Where no light is at all no exposure shows it."""
     beauty = planes["beauty"]
     there = beauty[..., 3] > 0.0
-    light = float(np.median(beauty[..., :3].max(axis=-1)[there])) if there.any() else 0.0
-    if not _WHITE < light < math.inf:
+    found = beauty[..., :3].max(axis=-1)[there]
+    light, brightest = np.percentile(found, (50.0, 95.0)).tolist() if found.size else (0.0, 0.0)
+    if _WHITE < light < math.inf:
+        text = "most of the picture is far above white"
+    elif 0.0 < brightest < _BLACK:
+        text, light = "the picture is nearly black", brightest
+    else:
         return ()
     stops = math.floor(settings.exposure - math.log2(light / _GREY))
-    text = f"most of the picture is far above white; --exposure {stops} shows it"
+    text += f"; --exposure {stops} shows it"
     return (Notice(camera.path or "/", text),)
 
 
