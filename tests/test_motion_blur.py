@@ -282,6 +282,20 @@ def test_velocities_win_over_the_next_sample() -> None:
     np.testing.assert_allclose(middle(at(text)(0.5)), (0.5, 1.0, 0.0), atol=1e-5)
 
 
+def test_what_ended_long_ago_stands() -> None:
+    """A cache of one frame seen at others: as far as a shutter around its ends is open, and no farther."""
+    corners, fast = "[(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]", [(24, 0, 0)] * 4
+    text = card(f"vector3f[] velocities.timeSamples = {{ 10: {fast} }}").replace(
+        "points = [(-0.5, -0.5, 0), (0.5, -0.5, 0), (0.5, 0.5, 0), (-0.5, 0.5, 0)]",
+        f"points.timeSamples = {{ 10: {corners} }}",
+    )
+    read = at(text + eye())
+    for code, moved in ((0.0, 0.0), (9.5, -0.5), (10.0, 0.0), (10.5, 0.5), (50.0, 0.0)):
+        np.testing.assert_allclose(middle(read(code)), (0.5 + moved, 0.5, 0.0), atol=1e-5)
+    assert read(10.0).cameras[0].shutter == (-0.5, 0.5)
+    assert read(50.0).cameras[0].shutter == (0.0, 0.0)
+
+
 def test_velocities_of_another_length_are_named_and_not_used() -> None:
     scene = at(flying("Mesh", "vector3f[] velocities.timeSamples = { 0: [(24, 0, 0)], 2: [(24, 0, 0)] }"))(1.0)
     assert any("velocities" in notice.text and "/F" in notice.text for notice in scene.notices)

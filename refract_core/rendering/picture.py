@@ -256,15 +256,15 @@ def nothing_seen(scene: Scene, camera: Camera, planes: dict[str, NDArray[np.floa
 
 
 _WHITE, _GREY, _BLACK = 3.0, 0.4, 0.005
-"""Light over which half of a picture, or under which all but its brightest twentieth, shows nothing, and what that should
-be instead."""
+"""Light over which half of a picture, or under which all but its brightest twentieth, shows nothing, and what that
+should be instead."""
 
 
 def out_of_range(
     camera: Camera, settings: RenderSettings, planes: dict[str, NDArray[np.float32]]
 ) -> tuple[Notice, ...]:
-    """Say that most of what is there is far above white, or nearly black, as of files that count lights in watts, and by
-    how much. Where no light is at all no exposure shows it."""
+    """Say that most of what is there is far above white, or nearly black, as of files that count lights in watts, and
+    by how much. Where no light is at all no exposure shows it."""
     beauty = planes["beauty"]
     there = beauty[..., 3] > 0.0
     found = beauty[..., :3].max(axis=-1)[there]
