@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scenes import box, camera, dome, draw, glass, globe, light, material, quad, scene
+from scenes import box, camera, dome, draw, glass, globe, light, material, quad, scene, view_rays
 
 from refract_core.kernels.compile import kernel
 from refract_core.kernels.pointer import Pointer
@@ -358,3 +358,24 @@ def test_the_highlight_of_any_triangles(seed: int, alpha: float) -> None:
     assert np.abs(found - expected).mean() < 0.02 * expected.mean()
     bright = expected.sum(1) > 0.05 * expected.sum(1).max()
     np.testing.assert_allclose(found[bright], expected[bright], rtol=0.12)
+
+
+@pytest.mark.parametrize("gap", [0.1, 0.01, 0.002])
+def test_a_sheet_that_hangs_below_a_ceiling_lights_it_around_itself(gap: float) -> None:
+    """Its upper side is seen at a slant, by the rule of rectangles. Rays to it start off the ceiling, so nearer to the
+    sheet than the place that is lit, and must not end in it for that."""
+    ceiling = quad("/ceiling", [(-4, 0, 4), (-4, 0, -4), (4, 0, -4), (4, 0, 4)], 0)
+    sheet = quad("/sheet", [(-1, -gap, -1), (1, -gap, -1), (1, -gap, 1), (-1, -gap, 1)], 1)
+    paint = [material("/grey", DIFFUSE=0.8, IOR=1.0), material("/glow", DIFFUSE=0.0, IOR=1.0, EMISSIVE=1.0)]
+    eye = np.array([1.5, -3.0, 0.0])
+    lens = camera(eye, (1.5, 0, 0), 0.1)
+    what = scene([ceiling, sheet], paint, cameras=(lens,))
+    _, d = view_rays(lens, 32, 32)
+    at = eye - d * (eye[1] / d[..., 1:2])
+    u, v = np.meshgrid(*[(np.arange(1000) + 0.5) / 500 - 1.0] * 2)
+    for x, y in [(16, 4), (16, 16), (3, 20), (29, 9)]:
+        away2 = (u - at[x, y, 0]) ** 2 + (v - at[x, y, 2]) ** 2 + gap * gap
+        form = (gap * gap / away2**2).mean() * 4.0 / np.pi
+        for settings in ({"samples": 1}, {"samples": 16, "tolerance": 0.03}):
+            seen = draw(what, 32, 32, emission_light=True, **settings)["beauty"][x, y, 0]
+            assert seen == pytest.approx(0.8 * form, rel=0.02)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from ..kernels.compile import inlined
 from ..kernels.lanes import LANES, Scalars, Vectors, put
 from ..kernels.sampling import chance_of_bits, hash32
-from ..kernels.vec import Vec, dot, mul, row, scale
+from ..kernels.vec import Vec, along, dot, length, mul, row, scale, sub
 from ..optics.interface import fresnel_dielectric, transmittance
 from ..optics.models import absorption_distance_of, exit_of, is_sheet, thickness_of
 from ..scene import Param
@@ -121,8 +123,17 @@ def intersect_world(packet: Packet, world: World, far: Scalars, coherent: bool) 
 
 @inlined
 def add_shadow_ray(packet: Packet, lane: int, point: Vec, ng: Vec, direction: Vec, distance: float) -> None:
-    """Put the segment from a surface to a light into a lane. `distance` [m] may be infinite."""
-    set_ray(packet, lane, off_surface(point, ng, direction), direction, 0.0, short_of(distance), SOLID)
+    """Put the segment from a surface to a light into a lane. `distance` [m] may be infinite.
+
+    From where it starts, off the surface, it goes to where it was meant to end: with the direction from the surface it
+    would meet what glows before that, where the two are near each other, and be stopped by the light itself.
+    """
+    start = off_surface(point, ng, direction)
+    if distance < math.inf:
+        way = sub(along(point, direction, distance), start)
+        distance = length(way)
+        direction = scale(way, 1.0 / max(distance, 1e-12))
+    set_ray(packet, lane, start, direction, 0.0, short_of(distance), SOLID)
 
 
 @inlined
