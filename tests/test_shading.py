@@ -156,8 +156,8 @@ def test_a_rough_mirror_is_quiet_and_right(roughness: float) -> None:
 
 
 def test_a_half_shadow_in_a_mirror_is_quiet() -> None:
-    """Beside the same picture of 256 samples a pixel. With one ray to the lamp from what a mirror ray meets it was three
-    times as far from it."""
+    """Beside the same picture of 256 samples a pixel. One ray to the lamp from where a mirror ray ends was three times
+    as far off."""
     chrome = material("/chrome", DIFFUSE=1.0, METALLIC=1.0, ROUGHNESS=0.0)
     mirror = quad("/mirror", [(-4, 0, -2), (4, 0, -2), (4, 4, -2), (-4, 4, -2)], 1)
     floor = quad("/floor", [(-4, 0, 4), (4, 0, 4), (4, 0, -2), (-4, 0, -2)], 0)

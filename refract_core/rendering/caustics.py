@@ -39,8 +39,9 @@ _LAYERS = 32
 """Surfaces that a photon may enter, whatever the picture's own limit is: light must get out."""
 _BATCH = 1024
 """Photons that a thread follows at once."""
-_WANTED = 4.0
-"""Photons in a texel, about: fewer are noise, more could be drawn finer."""
+_WANTED, _OF = 2.0, 1 << 16
+"""Photons in a texel, about, of so many: fewer are noise, more could be drawn finer. Of more, it is best to look at
+more at once (Silverman, "Density Estimation", 1986, section 5.2); by the square root, as measured."""
 _PIXELS = 1.2
 """Sides of a pixel that the smallest texel has, at least."""
 _COARSE = 8.0
@@ -315,12 +316,13 @@ def _written(landings: Landings, wanted: Wanted) -> Caustics:
     count = len(landings.part)
     slots = 1 << max(10, math.ceil(math.log2(count)))
     levels, limits, level, left = np.zeros(count, np.int32), finest[landings.part], 0, count
+    enough = _WANTED * math.sqrt(wanted.photons / _OF)
     while left > 0:
         tally = by_address(new_tally(slots))
         if not count_photons(tally, landed, texel[level], levels, level):
             slots *= 2
             continue
-        left = raise_levels(tally, landed, texel[level], limits, _WANTED, levels, level)
+        left = raise_levels(tally, landed, texel[level], limits, enough, levels, level)
         level += 1
     while True:
         table = new_caustics(slots, texel)

@@ -34,8 +34,9 @@ one always has .57."""
 _COLUMNS = 19
 """Bits of a column's or row's number, of which 21 bits are left to a layer, a side and a level."""
 _LAYERS = 16
-_FLAT = 0.99
-"""Length of the mean of unit normals below which a texel is too large for what it lies on: it bends, or has an edge."""
+_FLAT, _BENT = 0.99, 0.95
+"""Length of the mean of unit normals below which a texel is large for what it lies on: that bends, or has an edge. And
+below which it turns."""
 _FILTER = np.array([0.25, 0.5, 0.25])
 
 
@@ -170,7 +171,7 @@ def raise_levels(
 ) -> int:
     """Let photons of a level go on to the next, whose texels are a quarter as large, where these have `wanted` of them:
     as many of equal flux as would be as even (Kish, "Survey Sampling", 1965: the effective size of a sample). On
-    what bends inside of a texel a quarter is enough: noise is better than light that has gone astray.
+    what bends inside of a texel a quarter is enough, or a sixteenth: noise is better than light that has gone astray.
 
     Args:
         tally: of `count_photons`; those of another kind are not counted.
@@ -198,8 +199,10 @@ def raise_levels(
                 squares += share * tally.squares[slot]
                 number += share * tally.number[slot]
                 mean = along(mean, row(tally.normal, slot), share)
-        bent = length(mean) < _FLAT * number
-        if light * light >= (wanted if bent else 4.0 * wanted) * squares:
+        enough, one_way = 4.0 * wanted, length(mean)
+        if one_way < _FLAT * number:
+            enough = wanted if one_way >= _BENT * number else 0.25 * wanted
+        if light * light >= enough * squares:
             levels[k] = level + 1
             went += 1
     return went
