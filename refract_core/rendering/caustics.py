@@ -44,8 +44,8 @@ _WANTED, _OF = 2.0, 1 << 16
 more at once (Silverman, "Density Estimation", 1986, section 5.2); by the square root, as measured."""
 _PIXELS = 1.2
 """Sides of a pixel that the smallest texel has, at least."""
-_COARSE = 8.0
-"""Sides of a pixel that the largest has, about: what light falls on has edges and curves."""
+_COARSE = 16.0
+"""Sides of a pixel that the largest has, at least: what light falls on has edges and curves."""
 _PLATE = 0.9
 """Part of a body's surface that looks one way or the opposite, from which on it is a plate, which
 light leaves as it came."""
@@ -216,7 +216,7 @@ def _texels(world: World, casts: NDArray[np.bool_], camera: Camera, width: int) 
         away = np.maximum(np.linalg.norm(middle - camera.world_from_camera[:3, 3], axis=1), radius / 2)
         pixel = (np.ones(1) if camera.orthographic else away) * (right - left) / width
         wanted[g] = _PIXELS * pixel.min()
-        largest = max(largest, float(np.minimum(radius / 4, _COARSE * pixel).max()))
+        largest = max(largest, float(np.minimum(radius, _COARSE * pixel).max()))
     top = 2.0 ** math.ceil(math.log2(largest))
     finest[casts] = np.clip(np.ceil(np.log2(top / wanted[casts])), 0, LEVELS - 1)
     texel: F64 = top * np.power(0.5, np.arange(int(finest.max()) + 1))
