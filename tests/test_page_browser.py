@@ -278,6 +278,67 @@ def test_planes_come_in_false_colour_with_a_legend(page: Any) -> None:
     playwright.expect(page.locator("#legend")).to_be_hidden()
 
 
+def over(page: Any, column: int, row: int) -> tuple[float, float]:
+    """Where a pixel of the picture of 64 x 36 is on the screen."""
+    page.locator("#views").scroll_into_view_if_needed()
+    box = page.locator("#views").bounding_box()
+    return box["x"] + box["width"] * (column + 0.5) / 64, box["y"] + box["height"] * (row + 0.5) / 36
+
+
+def test_the_pixel_under_the_pointer_is_read_with_its_unit(page: Any) -> None:
+    pick(page)
+    read = page.locator("#readout")
+    page.mouse.move(*over(page, 2, 3))
+    playwright.expect(read).to_have_text("Pixel 2, 3: picture 8, 90, 21 of 255")
+    page.get_by_label("Show").select_option("thickness")
+    page.mouse.move(*over(page, 32, 18))
+    playwright.expect(read).to_have_text("Pixel 32, 18: thickness 0.311 m")  # 64 / 255 of 1.24 m
+    page.mouse.move(*over(page, 2, 3))
+    playwright.expect(read).to_have_text("Pixel 2, 3: thickness no glass")
+    page.get_by_label("Ready-made comparison").select_option("model")
+    status(page, BOTH_DONE)
+    page.mouse.move(*over(page, 32, 18))
+    playwright.expect(read).to_have_text("Pixel 32, 18: thickness A 0.311 m; B 0.311 m")
+    page.mouse.move(1, 1)
+    playwright.expect(read).to_contain_text("Point at the picture")
+
+
+def test_a_pixel_is_read_by_touch_and_marked(browser: Any, service: FakeService) -> None:
+    context = browser.new_context(viewport={"width": 390, "height": 800}, has_touch=True)
+    context.set_default_timeout(PATIENCE)
+    opened = context.new_page()
+    opened.goto(service.url)
+    pick(opened)
+    opened.touchscreen.tap(*over(opened, 2, 3))
+    playwright.expect(opened.locator("#readout")).to_contain_text(": picture ")
+    playwright.expect(opened.locator("#mark")).to_be_visible()
+    context.close()
+
+
+def test_fit_and_one_to_one_change_the_size_and_nothing_else(page: Any, service: FakeService) -> None:
+    pick(page)
+    width = "document.getElementById('views').getBoundingClientRect().width"
+    assert page.evaluate(width) > 64
+    page.get_by_role("button", name="1:1").click()
+    page.wait_for_function(f"() => {width} === 64")
+    assert page.get_by_role("button", name="1:1").get_attribute("aria-pressed") == "true"
+    page.get_by_role("button", name="Fit", exact=True).click()
+    page.wait_for_function(f"() => {width} > 64")
+    page.set_viewport_size({"width": 1200, "height": 300})  # all of it is seen in a low window, too
+    page.wait_for_function("() => document.getElementById('views').getBoundingClientRect().height <= 300")
+    assert len(service.asked("POST", "/v1/render")) == 1
+    assert "azimuth" not in asked(service)
+
+
+def test_the_picture_fills_the_screen_and_comes_back(page: Any) -> None:
+    pick(page)
+    page.get_by_role("button", name="Full screen").click()
+    page.wait_for_function("() => document.fullscreenElement?.id === 'figure'")
+    page.get_by_role("button", name="Leave full screen").click()
+    page.wait_for_function("() => !document.fullscreenElement")
+    playwright.expect(page.locator("#full")).to_have_text("Full screen")
+
+
 def test_tier_order_by_keyboard(page: Any, service: FakeService) -> None:
     pick(page)
     page.get_by_role("button", name="Move probe up").press("Enter")

@@ -16,3 +16,12 @@ export function falseColour(share) {
   const low = Math.min(Math.floor(at), RAMP.length - 2);
   return RAMP[low].map((from, channel) => Math.round(from + (RAMP[low + 1][channel] - from) * (at - low)));
 }
+
+const short = (value) => String(Number(value.toFixed(3)));
+
+/** What a pixel of a plane's PNG says: [red, green, blue] 0 .. 255, where white stands for `white`. */
+export function pixelText(name, [red, green, blue], white = 1) {
+  if (SCALARS.includes(name)) return `${Number(((red / 255) * white).toPrecision(3))}${UNITS[name] ?? ""}`;
+  if (name === "N") return [red, green, blue].map((value) => short((value / 255) * 2 - 1)).join(", ");
+  return `${red}, ${green}, ${blue} of 255`;
+}

@@ -5,9 +5,12 @@ import { plane, shownRun } from "./jobs.js";
 import { keepAddress } from "./link.js";
 import { RAMP, SCALARS, UNITS, falseColour } from "./planes.js";
 import { clearProblem, report } from "./problems.js";
-import { SIDES, sides, state } from "./state.js";
+import { SIDES, sides, state, tell } from "./state.js";
 
 let painting = 0;
+
+/** What is drawn of each side: {side, run, data, mask}; none while the camera moves. */
+export let painted = [];
 
 export async function paint() {
   const turn = ++painting;
@@ -33,6 +36,8 @@ export async function paint() {
     else if (one) draw($(`canvas-${side}`), one, scalar, high);
   }
   showFigure(loaded, scalar, high);
+  painted = loaded;
+  tell("painted");
 }
 
 /** A small picture of a camera that moves: smooth where it is drawn larger than it is. */
@@ -43,7 +48,7 @@ function drawFrame(canvas, frame) {
 }
 
 /** What white stands for in a run's PNG of the plane that is looked at. */
-const whiteOf = (run) => run.job.aovs?.find(({ name }) => name === state.view)?.white ?? 1;
+export const whiteOf = (run) => run.job.aovs?.find(({ name }) => name === state.view)?.white ?? 1;
 
 function draw(canvas, { side, run, beauty, data, mask }, scalar, high) {
   Object.assign(canvas, { width: data.width, height: data.height });
