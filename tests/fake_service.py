@@ -32,6 +32,14 @@ STAGES = [
 ]
 VIEW = {"camera": "/World/Near", "azimuth": 10.0, "elevation": 20.0, "distance": 4.0, "look_at": [0.0, 1.0, 0.0],
         "width": 0.5, "orthographic": False}  # fmt: skip
+VERDICT = {"format": "refract.validate/1", "errors": 1, "warnings": 1, "infos": 0, "findings": [
+    {"rule": "refract.x", "severity": "warning", "path": "/World/Ball", "text": "<b>odd</b>", "fix": "", "safe": False},
+    {"rule": "refract.y", "severity": "error", "path": "/World/Looks/Ball", "text": "ior is 0.5", "fix": "author 1.5",
+     "safe": True},
+]}  # fmt: skip
+CONVERTED = {"stage": "x.usda", "out": "converted.usdz", "notices": [{"path": "/World", "text": "left alone"}], "materials": [
+    {"path": "/World/Looks/Ball", "action": "applied", "model": "sphere", "ior": 1.5, "why": "a ball", "notes": []},
+]}  # fmt: skip
 TOOK = 1.9
 """[s] What every job says it took, whatever it did."""
 
@@ -172,6 +180,8 @@ class Handler(BaseHTTPRequestHandler):
             if colour is None:
                 return self.problem(404, "not-found", "There is nothing here", "")
             return self.reply(200, png(lambda x, y: colour), "image/png")
+        if path == "/v1/jobs/checked/file":
+            return self.reply(200, b"a converted stage", "model/vnd.usdz+zip")
         return self.job(*path.removeprefix("/v1/jobs/").split("/"))
 
     def live(self, settings: dict[str, Any]) -> None:
@@ -202,6 +212,9 @@ class Handler(BaseHTTPRequestHandler):
             return self.problem(422, "stage-unreadable", "The stage cannot be opened", f"{stage} is not a USD file.")
         if self.path == "/v1/inspect":
             return self.document(200, facts(stage))
+        if self.path in ("/v1/validate", "/v1/convert"):
+            made = {"Content-Location": "/v1/jobs/checked"}
+            return self.document(200, VERDICT if self.path == "/v1/validate" else CONVERTED, made)
         if settings.get("samples", 0) > 1000:
             where = [{"pointer": "/samples", "detail": "must be at most 1000"}]
             return self.problem(422, "invalid-settings", "The settings are not valid", "One field is wrong.", where)

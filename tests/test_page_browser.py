@@ -339,6 +339,49 @@ def test_the_picture_fills_the_screen_and_comes_back(page: Any) -> None:
     playwright.expect(page.locator("#full")).to_have_text("Full screen")
 
 
+def test_what_is_wrong_with_a_stage_is_listed_the_worst_first(page: Any) -> None:
+    pick(page)
+    page.get_by_role("button", name="Validate").click()
+    playwright.expect(page.locator("#checked-title")).to_have_text("1 error, 1 warning")
+    rows = page.locator("#checked-found li")
+    playwright.expect(rows).to_have_count(2)
+    for text in ("error", "/World/Looks/Ball", "ior is 0.5", "To mend it: author 1.5"):
+        playwright.expect(rows.nth(0)).to_contain_text(text)
+    playwright.expect(rows.nth(1)).to_contain_text("<b>odd</b>")  # as text
+    page.get_by_role("button", name="Close").click()
+    playwright.expect(page.locator("#checked")).to_be_hidden()
+    assert page.evaluate("document.activeElement.id") == "validate"
+
+
+def test_what_is_in_a_stage_can_be_read_and_taken_away(page: Any, tmp_path: Path) -> None:
+    pick(page)
+    page.get_by_role("button", name="Inspect").click()
+    playwright.expect(page.locator("#checked-title")).to_have_text("2 glass objects, 1 thing to look at")
+    playwright.expect(page.locator("#checked-found")).to_contain_text("sphere, index 1.5, roughness 0.25, thickness 0.5")
+    with page.expect_download() as taken:
+        page.get_by_role("button", name="Save as JSON").click()
+    assert taken.value.suggested_filename == "ball.inspect.json"
+    taken.value.save_as(tmp_path / "report.json")
+    assert '"refract.inspect/1"' in (tmp_path / "report.json").read_text()
+
+
+def test_a_converted_stage_can_be_taken_away(page: Any, service: FakeService, tmp_path: Path) -> None:
+    """And nothing stays of it once another stage is looked at."""
+    pick(page)
+    page.get_by_role("button", name="Convert").click()
+    playwright.expect(page.locator("#checked-title")).to_have_text("1 material described")
+    playwright.expect(page.locator("#checked-found")).to_contain_text("left alone")
+    with page.expect_download() as taken:
+        page.get_by_role("button", name="Download .usdz").click()
+    assert taken.value.suggested_filename == "ball.converted.usdz"
+    taken.value.save_as(tmp_path / "made.usdz")
+    assert (tmp_path / "made.usdz").read_bytes() == b"a converted stage"
+    assert [body["stage"] for body in service.asked("POST", "/v1/convert")] == ["ball.usda"]
+    page.get_by_role("button", name="Another stage").click()
+    choose(page, "room.usda")
+    playwright.expect(page.locator("#checked")).to_be_hidden()
+
+
 def test_tier_order_by_keyboard(page: Any, service: FakeService) -> None:
     pick(page)
     page.get_by_role("button", name="Move probe up").press("Enter")

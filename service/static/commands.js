@@ -16,7 +16,7 @@ export function asCurl(url, source, request) {
   return `curl --fail-with-body -F ${quoted(`stage=@${file}`)} --form-string ${quoted(`settings=${JSON.stringify(request)}`)} ${end}`;
 }
 
-export const pictureName = (name) => `${name.replace(/^.*\//, "").replace(/\.usd[acz]?$/i, "")}.png`;
+export const pictureName = (name) => `${name.replace(/^.*\//, "").replace(/\.(usd[acz]?|glb|gltf|zip)$/i, "")}.png`;
 
 /** The same render by the command line. */
 export function asCli(source, request) {

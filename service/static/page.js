@@ -1,6 +1,7 @@
 // The page of the service. No framework, no build step. This module starts it; none of the others does anything when it is
 // loaded, so that tests reach them without a document.
 
+import { wireChecks } from "./checks.js";
 import { $ } from "./dom.js";
 import { showCamera, showSettings, wireSettings } from "./form.js";
 import { changed, renderAll, stopAll } from "./jobs.js";
@@ -51,6 +52,7 @@ async function start() {
   wireOrbit();
   wireLooking();
   wireTaking();
+  wireChecks();
   $("render").onclick = renderAll;
   $("cancel").onclick = () => { stopAll(); showAll(); $("render").focus(); };
   $("auto").onchange = changed;

@@ -1,6 +1,7 @@
 // Which stage is looked at: a sample of the server, or a file that is dropped or chosen.
 
 import { bodyOf, send } from "./api.js";
+import { closeChecks } from "./checks.js";
 import { $, counted } from "./dom.js";
 import { drawChoices } from "./form.js";
 import { changed, stopAll } from "./jobs.js";
@@ -25,6 +26,7 @@ export function showChoice() {
   $("main").classList.toggle("empty", !state.source);
   $("choice").hidden = folded;
   $("other").hidden = !state.source;
+  $("checks").hidden = !state.facts;
   $("other").setAttribute("aria-expanded", String(!folded));
 }
 
@@ -32,6 +34,7 @@ export function showChoice() {
 export async function choose(source, link = null) {
   stopAll();
   closeViewer();
+  closeChecks();
   const waiting = (state.source = source);
   Object.assign(state, { choosing: false, facts: null, runs: { a: null, b: null }, moving: { a: null, b: null } });
   clearProblem();

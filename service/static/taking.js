@@ -2,7 +2,7 @@
 
 import { bodyOf, send } from "./api.js";
 import { asCli, asCurl, pictureName } from "./commands.js";
-import { $, make, say } from "./dom.js";
+import { $, download, say } from "./dom.js";
 import { plane } from "./jobs.js";
 import { toFragment } from "./link.js";
 import { report } from "./problems.js";
@@ -39,9 +39,7 @@ async function save(kind) {
   const run = state.runs[state.edit];
   try {
     const blob = kind === "png" ? (await plane(run, state.view)).blob : await exr();
-    const link = make("a", { href: URL.createObjectURL(blob), download: pictureName(state.source.name).replace(/png$/, kind) });
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+    download(blob, pictureName(state.source.name).replace(/png$/, kind));
   } catch (error) {
     report(error);
   }
