@@ -239,7 +239,8 @@ class Handler(BaseHTTPRequestHandler):
         message = email.parser.BytesParser(policy=email.policy.HTTP).parsebytes(head + raw)
         parts = {part.get_param("name", header="content-disposition"): part for part in message.iter_parts()}
         settings = json.loads(parts["settings"].get_content()) if "settings" in parts else {}
-        return str(parts["stage"].get_filename()), settings
+        beside = [part.get_filename() for part in message.iter_parts() if part.get_filename()][1:]
+        return str(parts["stage"].get_filename()), settings | ({"beside": beside} if beside else {})
 
     def refused(self) -> bool:
         allowed = not self.server.token or self.headers["Authorization"] == f"Bearer {self.server.token}"

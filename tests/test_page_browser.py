@@ -165,6 +165,37 @@ def test_a_file_can_be_dropped_anywhere(page: Any, service: FakeService) -> None
     assert asked(service)["stage"] == "dropped.usda"
 
 
+DROP = """names => {
+    const data = new DataTransfer();
+    for (const name of names) data.items.add(new File(['x'], name));
+    document.body.dispatchEvent(new DragEvent('drop', {dataTransfer: data, bubbles: true, cancelable: true}));
+}"""
+
+
+def test_a_gltf_is_dropped_with_what_lies_beside_it(page: Any, service: FakeService) -> None:
+    page.evaluate(DROP, ["vase.bin", "vase.gltf", "vase.png"])
+    status(page, DONE)
+    sent = asked(service)
+    assert (sent["stage"], sent["beside"]) == ("vase.gltf", ["vase.bin", "vase.png"])
+    page.get_by_role("button", name="Copy as curl").click()
+    assert " -F stage=@vase.gltf -F file=@vase.bin -F file=@vase.png " in page.locator("#copied").input_value()
+    page.evaluate(DROP, ["ball.glb"])
+    playwright.expect(page.locator("#facts")).to_contain_text("ball.glb:")
+    status(page, DONE)
+    assert "beside" not in asked(service)
+
+
+@pytest.mark.parametrize(("names", "why"), [
+    (["ball.obj"], "ball.obj is neither USD nor glTF"), (["a.glb", "b.usdz"], "a.glb, b.usdz could each be"),
+])  # fmt: skip
+def test_what_cannot_be_a_stage_is_told_before_it_is_sent(
+    page: Any, service: FakeService, names: list[str], why: str
+) -> None:
+    page.evaluate(DROP, names)
+    playwright.expect(page.get_by_role("alert")).to_contain_text(why)
+    assert service.asked("POST", "/v1/inspect") == []
+
+
 def test_progress_is_told_and_cancel_ends_the_job(page: Any, service: FakeService) -> None:
     service.seconds = NEVER
     choose(page)

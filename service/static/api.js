@@ -34,6 +34,7 @@ export function bodyOf(settings) {
   }
   const form = new FormData();
   form.set("stage", state.source.file, state.source.name);
+  for (const part of state.source.parts ?? []) form.append("file", part, part.name);
   if (Object.keys(settings).length) form.set("settings", JSON.stringify(settings));
   return { body: form, headers: {} };
 }

@@ -37,7 +37,7 @@ function inspected(facts) {
   const { prims = {}, time = {}, settings = {} } = facts;
   const rows = [
     { word: "stage", text: joined(`${facts.up_axis} up`, `${facts.metres_per_unit} m per unit`, time.authored && `time codes ${time.start} to ${time.end}`) },
-    { word: "prims", text: joined(...Object.entries(prims).map(([name, count]) => `${count} ${name}`)) },
+    { word: "prims", text: joined(...Object.entries(prims).map(([name, count]) => count && `${count} ${name === "all" ? "in all" : name}`)) },
     { word: "usual settings", text: joined(settings.tiers?.join(", "), `${settings.max_layers} surfaces`, counted(settings.samples, "sample")) },
     ...(facts.cameras ?? []).map(({ path, used }) => ({ word: used ? "camera, used" : "camera", path })),
     ...(facts.glass ?? []).map((one) => ({
@@ -48,7 +48,7 @@ function inspected(facts) {
     ...(facts.probes ?? []).map((one) => ({ word: "probe", path: one.path, text: joined(one.mode, one.covers?.length && `covers ${one.covers.join(", ")}`) })),
   ];
   const odd = [...(facts.suspicious ?? []), ...(facts.unsupported ?? [])];
-  return { title: `${counted(facts.glass?.length ?? 0, "glass object")}, ${counted(odd.length, "thing")} to look at`, rows: [...findingRows(odd), ...rows] };
+  return { title: joined(counted(facts.glass?.length ?? 0, "glass object"), odd.length && `${counted(odd.length, "thing")} to look at`), rows: [...findingRows(odd), ...rows] };
 }
 
 function validated({ findings = [] }) {

@@ -12,8 +12,9 @@ export function asCurl(url, source, request) {
     const body = JSON.stringify({ stage: source.name, ...request });
     return `curl --fail-with-body -H 'Content-Type: application/json' -d ${quoted(body)} ${end}`;
   }
-  const file = /[;,"\\]/.test(source.name) ? `"${source.name.replace(/[\\"]/g, "\\$&")}"` : source.name;
-  return `curl --fail-with-body -F ${quoted(`stage=@${file}`)} --form-string ${quoted(`settings=${JSON.stringify(request)}`)} ${end}`;
+  const asFile = (name) => (/[;,"\\]/.test(name) ? `"${name.replace(/[\\"]/g, "\\$&")}"` : name);
+  const parts = (source.parts ?? []).map(({ name }) => ` -F ${quoted(`file=@${asFile(name)}`)}`).join("");
+  return `curl --fail-with-body -F ${quoted(`stage=@${asFile(source.name)}`)}${parts} --form-string ${quoted(`settings=${JSON.stringify(request)}`)} ${end}`;
 }
 
 export const pictureName = (name) => `${name.replace(/^.*\//, "").replace(/\.(usd[acz]?|glb|gltf|zip)$/i, "")}.png`;

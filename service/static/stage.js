@@ -1,6 +1,6 @@
 // Which stage is looked at: a sample of the server, or a file that is dropped or chosen.
 
-import { bodyOf, send } from "./api.js";
+import { Problem, bodyOf, send } from "./api.js";
 import { closeChecks } from "./checks.js";
 import { $, counted } from "./dom.js";
 import { drawChoices } from "./form.js";
@@ -72,9 +72,18 @@ function factsText(name, facts) {
     (worry ? `; ${counted(worry, "thing")} to look at, under Notices.` : ".");
 }
 
-function openFile(file) {
-  if (!file) return;
-  choose({ name: file.name, file });
+const STAGE = /\.(usd[acz]?|glb|gltf|zip)$/i;
+
+/** One stage and, where it needs them, the files beside it: a .gltf's buffer and textures. */
+function openFiles(files) {
+  const all = [...files];
+  const stages = all.filter(({ name }) => STAGE.test(name));
+  if (stages.length === 1) return choose({ name: stages[0].name, file: stages[0], parts: all.filter((one) => one !== stages[0]) });
+  if (!all.length) return;
+  clearProblem();
+  report(new Problem(stages.length
+    ? { title: "Which of them is the stage?", detail: `${stages.map(({ name }) => name).join(", ")} could each be. Take one of them with its textures, or a .zip or .usdz of all.` }
+    : { title: "This is no stage", detail: `${all[0].name} is neither USD nor glTF. Take a .usd, .usda, .usdc, .usdz, .glb or .gltf, or a .zip with one of them; a folder as a .zip.` }));
 }
 
 function openSample(name) {
@@ -87,7 +96,7 @@ function openSample(name) {
 export function wireStage() {
   const drop = $("drop");
   $("other").onclick = () => { state.choosing = !state.choosing; showChoice(); };
-  $("file").onchange = () => openFile($("file").files[0]);
+  $("file").onchange = () => openFiles($("file").files);
   document.ondragover = (event) => {
     if (!event.dataTransfer.types.includes("Files")) return;
     event.preventDefault();
@@ -98,6 +107,6 @@ export function wireStage() {
     drop.classList.remove("over");
     if (!event.dataTransfer.files.length) return;
     event.preventDefault();
-    openFile(event.dataTransfer.files[0]);
+    openFiles(event.dataTransfer.files);
   };
 }
