@@ -68,11 +68,12 @@ def glass(name: str, model: str) -> dict[str, Any]:
 
 def facts(stage: str) -> dict[str, Any]:
     cameras = [{"path": f"/World/{name}", "used": name == "Near", "orthographic": False} for name in ("Near", "Far")]
+    moves = stage.startswith("moving")
     odd = {"rule": "refract.x", "severity": "warning", "path": "/World/Ball", "text": "<b>odd</b>", "fix": ""}
     return {
         "format": "refract.inspect/1", "stage": stage, "engine": "0", "up_axis": "Y", "metres_per_unit": 1.0,
         "metres_per_unit_authored": True,
-        "time": {"start": 0.0, "end": 0.0, "authored": False, "frames_per_second": 24.0},
+        "time": {"start": 1.0, "end": 48.0 if moves else 1.0, "authored": moves, "frames_per_second": 24.0},
         "prims": {"all": 9, "meshes": 2, "materials": 2, "lights": 1, "instances": 0, "instancers": 0},
         "settings": {"tiers": ["screen", "probe", "sky"], "max_layers": 16, "samples": 4},
         "environment": True, "glass": [glass("Ball", "sphere"), glass("Block", "box")], "probes": [], "unsupported": [],

@@ -492,6 +492,26 @@ def test_a_viewer_that_has_ended_is_followed_by_another(page: Any, service: Fake
     until(page, lambda: service.asked("DELETE", "/v1/live/b") == [None])  # its place is for others
 
 
+def test_a_stage_that_moves_is_played_and_stops_where_it_is_told(page: Any, service: FakeService) -> None:
+    page.evaluate(DROP, ["moving.usda"])
+    status(page, DONE)
+    page.wait_for_selector("#canvas-a:visible")
+    page.get_by_role("button", name="Play").click()
+    live = lambda: {body.get("time_code") for body in service.asked("POST", "/v1/live/")}  # noqa: E731
+    until(page, lambda: len(live()) > 3)
+    page.get_by_role("button", name="Pause").click()
+    status(page, DONE)
+    stands = float(page.locator("#time-now").inner_text())
+    until(page, lambda: asked(service).get("time_code") == stands)
+    assert live() <= {*map(float, range(1, 49))}
+    page.get_by_label("Time code").first.fill("7")
+    until(page, lambda: not small_last(service) and asked(service).get("time_code") == 7)
+    status(page, DONE)
+    page.get_by_role("button", name="Another stage").click()
+    pick(page)  # which stands still
+    assert page.locator("#timing").is_hidden()
+
+
 def small_last(service: FakeService) -> bool:
     return service.asked("POST", "/v1/render")[-1].get("quality") == "draft"
 

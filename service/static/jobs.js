@@ -18,7 +18,7 @@ export function changed() {
   clearTimeout(address);
   address = setTimeout(() => state.source && keepAddress(state), 200); // browsers refuse it for every pixel of a drag
   clearTimeout(timer);
-  if ($("auto").checked && state.facts) timer = setTimeout(renderAll, 450);
+  if ($("auto").checked && state.facts && !state.playing) timer = setTimeout(renderAll, 450);
   showProgress();
   showButtons();
 }

@@ -26,10 +26,10 @@ export function nextWidth(wide, milliseconds) {
   return Math.round(Math.min(Math.max((wide + fitting) / 2, WIDTHS[0]), WIDTHS[1]));
 }
 
-/** The camera has moved. */
+/** The camera has moved, or time. Returns whether all went well. */
 export async function moving() {
   stale = true;
-  if (busy) return;
+  if (busy) return true;
   busy = true;
   try {
     while (stale && state.source) {
@@ -38,9 +38,11 @@ export async function moving() {
     }
   } catch (error) {
     report(error);
+    return false;
   } finally {
     busy = false;
   }
+  return true;
 }
 
 /** Let the viewer's stage go. */

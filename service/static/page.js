@@ -9,6 +9,7 @@ import { fromFragment } from "./link.js";
 import { closeViewer } from "./live.js";
 import { showReading, showSize, wireLooking } from "./looking.js";
 import { showTurning, wireOrbit } from "./orbit.js";
+import { showTime, wireTime } from "./playing.js";
 import { clearProblem } from "./problems.js";
 import { choose, listSamples, showChoice, wireStage } from "./stage.js";
 import { hear, state } from "./state.js";
@@ -23,6 +24,7 @@ function showAll() {
   showButtons();
   showNotices();
   showTurning();
+  showTime();
   paint();
 }
 
@@ -41,7 +43,7 @@ async function openLink() {
 }
 
 async function start() {
-  hear("settings", () => { showSettings(); showTurning(); changed(); });
+  hear("settings", () => { showSettings(); showTurning(); showTime(); changed(); });
   hear("camera", () => { showCamera(); showTurning(); changed(); });
   hear("frame", paint);
   hear("painted", () => { showSize(); showReading(); });
@@ -51,6 +53,7 @@ async function start() {
   wireView();
   wireOrbit();
   wireLooking();
+  wireTime();
   wireTaking();
   wireChecks();
   $("render").onclick = renderAll;

@@ -36,7 +36,7 @@ export async function choose(source, link = null) {
   closeViewer();
   closeChecks();
   const waiting = (state.source = source);
-  Object.assign(state, { choosing: false, facts: null, runs: { a: null, b: null }, moving: { a: null, b: null } });
+  Object.assign(state, { choosing: false, playing: false, facts: null, runs: { a: null, b: null }, moving: { a: null, b: null } });
   clearProblem();
   tell("all");
   $("facts").textContent = `Looking into ${source.name} …`;

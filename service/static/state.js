@@ -8,7 +8,7 @@ export const ACTIVE = ["sending", "queued", "running"];
 
 export const state = {
   source: null, choosing: false, facts: null, settings: { a: defaultSettings(), b: defaultSettings() }, edit: "a", compare: false,
-  view: "beauty", split: 50, runs: { a: null, b: null }, moving: { a: null, b: null }, token: "",
+  view: "beauty", split: 50, runs: { a: null, b: null }, moving: { a: null, b: null }, playing: false, token: "",
 };
 
 export const sides = () => (state.compare ? SIDES : ["a"]);
