@@ -37,9 +37,9 @@ VERDICT = {"format": "refract.validate/1", "errors": 1, "warnings": 1, "infos": 
     {"rule": "refract.y", "severity": "error", "path": "/World/Looks/Ball", "text": "ior is 0.5", "fix": "author 1.5",
      "safe": True},
 ]}  # fmt: skip
-CONVERTED = {"stage": "x.usda", "out": "converted.usdz", "notices": [{"path": "/World", "text": "left alone"}], "materials": [
-    {"path": "/World/Looks/Ball", "action": "applied", "model": "sphere", "ior": 1.5, "why": "a ball", "notes": []},
-]}  # fmt: skip
+BALL = {"path": "/World/Looks/Ball", "action": "applied", "model": "sphere", "ior": 1.5, "why": "a ball", "notes": []}
+CONVERTED = {"stage": "x.usda", "out": "converted.usdz", "materials": [BALL],
+             "notices": [{"path": "/World", "text": "left alone"}]}  # fmt: skip
 TOOK = 1.9
 """[s] What every job says it took, whatever it did."""
 

@@ -388,7 +388,8 @@ def test_what_is_in_a_stage_can_be_read_and_taken_away(page: Any, tmp_path: Path
     pick(page)
     page.get_by_role("button", name="Inspect").click()
     playwright.expect(page.locator("#checked-title")).to_have_text("2 glass objects, 1 thing to look at")
-    playwright.expect(page.locator("#checked-found")).to_contain_text("sphere, index 1.5, roughness 0.25, thickness 0.5")
+    glass = "sphere, index 1.5, roughness 0.25, thickness 0.5"
+    playwright.expect(page.locator("#checked-found")).to_contain_text(glass)
     with page.expect_download() as taken:
         page.get_by_role("button", name="Save as JSON").click()
     assert taken.value.suggested_filename == "ball.inspect.json"
@@ -504,7 +505,7 @@ def test_a_stage_that_moves_is_played_and_stops_where_it_is_told(page: Any, serv
     stands = float(page.locator("#time-now").inner_text())
     until(page, lambda: asked(service).get("time_code") == stands)
     assert live() <= {*map(float, range(1, 49))}
-    page.get_by_label("Time code").first.fill("7")
+    page.get_by_role("slider", name="Time").fill("7")
     until(page, lambda: not small_last(service) and asked(service).get("time_code") == 7)
     status(page, DONE)
     page.get_by_role("button", name="Another stage").click()

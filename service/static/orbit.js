@@ -70,7 +70,7 @@ export function showTurning() {
   const settings = state.settings[state.edit];
   $("turning").hidden = !view();
   $("back").disabled = [...ORBIT, "look_at"].every((name) => settings[name] === null);
-  for (const name of ORBIT) $(`set-${name}`).placeholder = view() ? String(round(view().own[name], 4)) : "";
+  for (const name of ORBIT) $(`set-${name}`).placeholder = view() ? String(round(Number(view().own[name].toFixed(6)), 4)) : ""; // no 2e-16
 }
 
 function back() {
