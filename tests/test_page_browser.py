@@ -612,6 +612,34 @@ def test_it_fits_a_narrow_screen(page: Any, scheme: str) -> None:
     assert page.evaluate("document.documentElement.scrollWidth") == 360
 
 
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1280, 390])
+def test_axe_finds_nothing(page: Any, scheme: str, width: int) -> None:
+    """axe-core's own rules, on the first screen, with everything open, and where something went wrong."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+
+    def found() -> list[tuple[str, list[Any]]]:
+        return [(one["id"], [node["target"] for node in one["nodes"]]) for one in axe.run(page).response["violations"]]
+
+    page.set_viewport_size({"width": width, "height": 844})
+    page.emulate_media(color_scheme=scheme)
+    playwright.expect(page.locator("#gallery canvas")).to_have_count(2)
+    assert found() == []
+    page.evaluate(DROP, ["moving.usda"])
+    status(page, DONE)
+    page.get_by_label("Ready-made comparison").select_option("model")
+    status(page, BOTH_DONE)
+    page.get_by_label("Show").select_option("thickness")
+    playwright.expect(page.locator("#legend")).to_be_visible()
+    page.get_by_role("button", name="Validate").click()
+    playwright.expect(page.locator("#checked-found li")).to_have_count(2)
+    page.evaluate("for (const node of document.querySelectorAll('details')) node.open = true")
+    assert found() == []
+    page.evaluate(DROP, ["ball.obj"])
+    playwright.expect(page.get_by_role("alert")).to_be_visible()
+    assert found() == []
+
+
 # --- the service itself ---------------------------------------------------------------------------------------------
 
 SERVE = """
