@@ -30,7 +30,7 @@ class CustomBuildHook(BuildHookInterface[Any]):
         if importlib.util.find_spec("numba") is None:
             self.app.display_info("kernels are not compiled ahead of time: there is no numba in this build")
             return
-        self.app.display_info("compiling kernels, about half a minute")
+        self.app.display_info("compiling kernels, a minute or two")
         self._place = tempfile.TemporaryDirectory()
         ended = _build(Path(self.root), Path(self._place.name))
         self.app.display_info(ended.stdout.strip() or ended.stderr.strip())

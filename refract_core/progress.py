@@ -14,7 +14,7 @@ from .errors import UsageError
 
 MODES = ("auto", "lines", "json", "none")
 
-COMPILING = "compiling kernels (first run only, about half a minute)"
+COMPILING = "compiling kernels (first run only, a minute or two)"
 """The one stage of work that is told without a terminal too: whoever waits for so long must know why."""
 _STEP = 0.01
 """Smallest advance worth a line of JSON."""

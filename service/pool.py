@@ -136,7 +136,7 @@ class Nursery:
                 [sys.executable, "-m", "refract_core.service.worker", str(theirs.fileno())], pass_fds=[theirs.fileno()],
                 cwd=Path(refract_core.__file__).parents[1], env=environment(), stdin=subprocess.DEVNULL, stdout=2,
             )  # fmt: skip
-        log.info("the first worker is getting warm; where kernels are to be compiled first, it takes half a minute")
+        log.info("the first worker is getting warm; where kernels are to be compiled first, it takes a minute or two")
         loop = asyncio.get_running_loop()
         while data := await loop.sock_recv(ours, 65536):
             message = json.loads(data)

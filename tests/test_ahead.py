@@ -35,7 +35,7 @@ def possible() -> str:
 
 
 def on_what_is_built(test: Any) -> Any:
-    """A test of the kernels in a wheel, whose making takes half a minute."""
+    """A test of the kernels in a wheel, whose making takes a minute or two."""
     return pytest.mark.slow(pytest.mark.skipif(bool(possible()), reason=possible() or "it can")(test))
 
 

@@ -2,7 +2,7 @@
 
     python -m refract_core.kernels.build [FOLDER]
 
-It needs numba and a C compiler, takes about half a minute, and knows Linux on x86-64. The code is for processors from
+It needs numba and a C compiler, takes a minute or two, and knows Linux on x86-64. The code is for processors from
 2013 on (AVX2 and FMA, "x86-64-v3"), and gives the same pictures as what numba compiles for the machine itself. Without
 FOLDER the result goes beside this file, where `ahead` looks: in a checkout, until a source is edited.
 """
