@@ -59,6 +59,7 @@ REASONS: dict[str, str] = {
     "baked_and_realtime": f"{_PROBES}.",
     "two_probes": f"{_PROBES}.",
     "curves": "coil and rods are a few pixels wide, so most of their glass is edges, which take 16 samples.",
+    "stained_glass": "its leads are about a pixel wide, so they are edges, which take 16 samples.",
     "traced": "the facets of the gem throw sparks of the lamps, in colours, which are smaller than a pixel.",
     f"{_GLTF}/GlassBrokenWindow/GlassBrokenWindow.glb": f"{_CORNERS}: the cracks, which a texture draws.",
     f"{_GLTF}/GlassVaseFlowers/GlassVaseFlowers.glb": f"{_CORNERS}: stems and leaves.",
