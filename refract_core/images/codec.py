@@ -99,6 +99,30 @@ def is_straight(spec: Any) -> bool:
     return bool(spec.get_int_attribute(STRAIGHT_ALPHA, 0))
 
 
+@contextmanager
+def open_picture(path: str, name: str, *, as_stored: bool = False) -> Iterator[Any]:
+    """OpenImageIO's reader of a file, closed afterwards.
+
+    Args:
+        as_stored: colours are not multiplied by an alpha that they are kept without.
+
+    Raises:
+        ImageError: unreadable.
+    """
+    import OpenImageIO as oiio
+
+    config = oiio.ImageSpec()
+    if as_stored:
+        config.attribute(STRAIGHT_ALPHA, 1)
+    file = oiio.ImageInput.open(path, config)
+    if file is None:
+        raise ImageError(f"{name}: not a readable image: {reason(oiio.geterror(), path)}")
+    try:
+        yield file
+    finally:
+        file.close()
+
+
 def read_channels(path: str, name: str) -> Channels:
     """Decode the first image in a file with all its channels; 8-bit integers stay so, the rest becomes float32.
 
@@ -107,12 +131,7 @@ def read_channels(path: str, name: str) -> Channels:
     """
     import OpenImageIO as oiio
 
-    config = oiio.ImageSpec()
-    config.attribute(STRAIGHT_ALPHA, 1)
-    file = oiio.ImageInput.open(path, config)
-    if file is None:
-        raise ImageError(f"{name}: not a readable image: {reason(oiio.geterror(), path)}")
-    try:
+    with open_picture(path, name, as_stored=True) as file:
         spec = file.spec()
         check_size(spec, name)
         small = spec.format.basetype in (oiio.UINT8, oiio.INT8)
@@ -120,8 +139,6 @@ def read_channels(path: str, name: str) -> Channels:
         if pixels is None:
             raise ImageError(f"{name}: damaged image: {reason(file.geterror(), path)}")
         return Channels(_display_window(pixels.reshape(spec.height, spec.width, spec.nchannels), spec), spec)
-    finally:
-        file.close()
 
 
 def read_parts(path: str, name: str, wanted: Collection[str]) -> dict[str, NDArray[np.float32]]:
@@ -140,10 +157,7 @@ def read_parts(path: str, name: str, wanted: Collection[str]) -> dict[str, NDArr
     import OpenImageIO as oiio
 
     found: dict[str, NDArray[np.float32]] = {}
-    file = oiio.ImageInput.open(path)
-    if file is None:
-        raise ImageError(f"{name}: not a readable image: {reason(oiio.geterror(), path)}")
-    try:
+    with open_picture(path, name) as file:
         size, part = (0, 0), 0
         while file.seek_subimage(part, 0):
             spec = file.spec()
@@ -159,8 +173,6 @@ def read_parts(path: str, name: str, wanted: Collection[str]) -> dict[str, NDArr
                 found |= {spec.channelnames[k]: shown[..., k - first] for k in mine}
             part += 1
         return found
-    finally:
-        file.close()
 
 
 def read_size(path: str, name: str) -> tuple[int, int, bool]:
@@ -171,15 +183,10 @@ def read_size(path: str, name: str) -> tuple[int, int, bool]:
     """
     import OpenImageIO as oiio
 
-    file = oiio.ImageInput.open(path)
-    if file is None:
-        raise ImageError(f"{name}: not a readable image: {reason(oiio.geterror(), path)}")
-    try:
+    with open_picture(path, name) as file:
         spec = file.spec()
         check_size(spec, name)
         return spec.full_width, spec.full_height, spec.format.basetype in (oiio.UINT8, oiio.INT8)
-    finally:
-        file.close()
 
 
 def read_matrix(path: str, name: str, wanted: Sequence[str]) -> F64:
@@ -191,15 +198,8 @@ def read_matrix(path: str, name: str, wanted: Sequence[str]) -> F64:
     Raises:
         ImageError: the file is unreadable, or has no such matrix.
     """
-    import OpenImageIO as oiio
-
-    file = oiio.ImageInput.open(path)
-    if file is None:
-        raise ImageError(f"{name}: not a readable image: {reason(oiio.geterror(), path)}")
-    try:
+    with open_picture(path, name) as file:
         attributes: dict[str, Any] = {str(one.name).lower(): one.value for one in file.spec().extra_attribs}
-    finally:
-        file.close()
     for known in wanted:
         if known in attributes and np.shape(attributes[known]) == (16,):
             return np.asarray(attributes[known], np.float64).reshape(4, 4)

@@ -22,7 +22,17 @@ import numpy as np
 from ..errors import ImageError, UsageError
 from ..files import write_whole
 from ..scene import CUBE_LEVELS, F32, Cubemap
-from .codec import HALF_MAX, check_size, exr_spec, extension_of, memory_file, named_file, read_pixels, reason
+from .codec import (
+    HALF_MAX,
+    check_size,
+    exr_spec,
+    extension_of,
+    memory_file,
+    named_file,
+    open_picture,
+    read_pixels,
+    reason,
+)
 from .layouts import LAYOUTS, arrange, faces_of, halved
 from .srgb import srgb_decode
 
@@ -170,14 +180,8 @@ def read_notes(source: str | bytes, name: str) -> dict[str, str | int | float]:
     Raises:
         ImageError: not a readable image.
     """
-    import OpenImageIO as oiio
-
-    with named_file(source, name) as path:
-        file = oiio.ImageInput.open(path)
-        if file is None:
-            raise ImageError(f"{name}: not a readable image: {reason(oiio.geterror(), path)}")
+    with named_file(source, name) as path, open_picture(path, name) as file:
         attributes: dict[str, Any] = {str(one.name): one.value for one in file.spec().extra_attribs}
-        file.close()
     return {key.removeprefix(_OURS): value for key, value in attributes.items() if key.startswith(_OURS)}
 
 
@@ -194,12 +198,7 @@ def _faces(texels: F32, name: str, resolution: int) -> F32:
 
 def _own_levels(path: str, name: str, resolution: int) -> tuple[F32, ...]:
     """Levels of a file that `write_cubemap` wrote; none where somebody else did."""
-    import OpenImageIO as oiio
-
-    file = oiio.ImageInput.open(path)
-    if file is None:
-        raise ImageError(f"{name}: not a readable image: {reason(oiio.geterror(), path)}")
-    try:
+    with open_picture(path, name) as file:
         spec = file.spec()
         if spec.get_string_attribute(_LAYOUT, "") not in LAYOUTS or tuple(spec.channelnames) != CHANNELS:
             return ()
@@ -209,8 +208,6 @@ def _own_levels(path: str, name: str, resolution: int) -> tuple[F32, ...]:
             count = spec.get_int_attribute(_LEVELS, 1)
             return _stored_levels(file, picture, count if count == CUBE_LEVELS else 1, path, name)
         return (_with_distance(_faces(_with_share(picture), name, resolution)),)
-    finally:
-        file.close()
 
 
 def _stored_levels(file: Any, first: F32, count: int, path: str, name: str) -> tuple[F32, ...]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import ImageError, UsageError
 from ..files import write_whole
-from .codec import STRAIGHT_ALPHA, encoded_parts, extension_of, reason
+from .codec import STRAIGHT_ALPHA, encoded_parts, extension_of, open_picture, reason
 from .pictures import PLACE
 
 JOINED = (".exr", ".png")
@@ -112,16 +112,9 @@ def _size(piece: _Piece) -> str:
 
 def _read(path: str) -> _Piece:
     """Pixels as they are stored: 8 bits, halves, or floats that halves are in exactly."""
-    import OpenImageIO as oiio
-
     if not Path(path).is_file():
         raise ImageError(f"{path}: there is no such file; draw that part first, or correct the path")
-    config = oiio.ImageSpec()
-    config.attribute(STRAIGHT_ALPHA, 1)
-    file = oiio.ImageInput.open(path, config)
-    if file is None:
-        raise ImageError(f"{path}: not a readable image: {reason(oiio.geterror(), path)}")
-    try:
+    with open_picture(path, path, as_stored=True) as file:
         words = str(file.spec().getattribute(PLACE) or "").split()
         if len(words) != 4 or not all(word.isdigit() for word in words):
             raise ImageError(f"{path}: does not say where in a picture it belongs; it is no part that refract drew")
@@ -135,8 +128,6 @@ def _read(path: str) -> _Piece:
             images.append(_Image(pixels.reshape(spec.height, spec.width, spec.nchannels), spec))
         x, y, width, height = (int(word) for word in words)
         return _Piece(path, images, (x, y, width, height))
-    finally:
-        file.close()
 
 
 def _whole_spec(spec: Any, out: str, width: int, height: int, names: dict[str, dict[str, str]]) -> Any:

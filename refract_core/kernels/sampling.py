@@ -136,16 +136,16 @@ def pixel_offsets(samples: int) -> list[tuple[float, float]]:
     A Hammersley set whose second coordinate is ranked, so that any number of samples is a Latin square, balanced about
     the centre: one sample stands there, four have a quarter each, and the picture never leans to a side.
     """
-    order = np.argsort([_radical_inverse(i) for i in range(samples)]).argsort()
+    order = np.argsort([radical_inverse(i, 2) for i in range(samples)]).argsort()
     points = [((i + 0.5) / samples - 0.5, (int(order[i]) + 0.5) / samples - 0.5) for i in range(samples)]
     return sorted(points, key=lambda p: (p[0] * p[0] + p[1] * p[1], p))
 
 
-def _radical_inverse(i: int) -> float:
-    """Digits of `i` to the base 2, mirrored at the point (van der Corput 1935)."""
-    value, digit = 0.0, 0.5
+def radical_inverse(i: int, base: int) -> float:
+    """Digits of `i` to a base, mirrored at the point (van der Corput 1935; Halton 1960)."""
+    value, digit = 0.0, 1.0 / base
     while i:
-        value += digit * (i & 1)
-        i >>= 1
-        digit *= 0.5
+        value += digit * (i % base)
+        i //= base
+        digit /= base
     return value

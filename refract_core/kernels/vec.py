@@ -75,6 +75,14 @@ def normalize(a: Vec) -> Vec:
 
 
 @inlined
+def towards(p: Vec, target: Vec) -> tuple[Vec, float]:
+    """Unit direction from a point to another, and the way there."""
+    d = sub(target, p)
+    distance = length(d)
+    return scale(d, 1.0 / max(distance, 1e-12)), distance
+
+
+@inlined
 def flip_towards(n: Vec, w: Vec) -> Vec:
     """`n` or its opposite, whichever is on the side of `w`."""
     if dot(n, w) < 0.0:

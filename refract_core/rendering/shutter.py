@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from ..kernels.sampling import pixel_offsets
+from ..kernels.sampling import pixel_offsets, radical_inverse
 from ..scene import Camera, Notice, Scene
 from ..settings import RenderSettings
 from .ready import Ready
@@ -60,7 +60,7 @@ def moments_of(camera: Camera, settings: RenderSettings, time_code: float) -> li
     at_frame = min(max(-opens / (closes - opens), 0.0), 1.0)  # share of the shutter
     wanted = min(int(at_frame * parts), parts - 1)
     places = [round((x + 0.5) * count - 0.5) for x, _ in pixel_offsets(count)]
-    ranks = {place: rank for rank, place in enumerate(sorted(range(count), key=_radical_inverse))}
+    ranks = {place: rank for rank, place in enumerate(sorted(range(count), key=lambda i: radical_inverse(i, 3)))}
     turn = wanted - ranks[places[0]] * parts // count
     by_part: dict[int, list[int]] = {}
     for sample, place in enumerate(places):
@@ -70,16 +70,6 @@ def moments_of(camera: Camera, settings: RenderSettings, time_code: float) -> li
         share = at_frame if part == wanted else (part + 0.5) / parts
         found.append(Moment(time_code + opens + share * (closes - opens), tuple(samples)))
     return found
-
-
-def _radical_inverse(i: int) -> float:
-    """Digits of `i` to the base 3, mirrored at the point (Halton 1960)."""
-    value, digit = 0.0, 1.0 / 3.0
-    while i:
-        value += digit * (i % 3)
-        i //= 3
-        digit /= 3.0
-    return value
 
 
 def shutter_of_few(

@@ -19,7 +19,7 @@ from typing import NamedTuple
 from ..kernels.arrays import F32_1D, F64_1D, F64_2D, F64_3D, I32_1D, I64_2D, U8_1D, U8_2D
 from ..kernels.choice import choice
 from ..kernels.compile import inlined, leaf
-from ..kernels.vec import Vec, add, cross, dot, frame, length, lerp, normalize, row, scale, sub
+from ..kernels.vec import Vec, add, cross, dot, frame, length, lerp, normalize, row, scale, sub, towards
 from ..optics.lobes import ggx, sample_cosine, smith_visibility, specular_albedo
 from ..scene import LightKind
 from .glow import GlowTree, glow_highlight, glow_irradiance, glow_target
@@ -133,7 +133,7 @@ def shadow_ray(lights: LightTable, which: int, p: Vec, n: Vec, u1: float, u2: fl
     """
     if lights.kind[which] == LightKind.GLOW.value:
         point, worth = glow_target(lights.glow, lights.root[which], p, n, u1, u2)
-        direction, distance = _towards(p, point)
+        direction, distance = towards(p, point)
         return direction, distance, worth * max(0.0, dot(direction, n))
     lamp = lamp_of(lights, which)
     direction, distance = target_on(lights.kind[which], lamp, p, n, u1, u2)
@@ -241,13 +241,6 @@ def lamp_ahead(lights: LightTable, which: int, p: Vec, d: Vec) -> float:
 
 
 @inlined
-def _towards(p: Vec, target: Vec) -> tuple[Vec, float]:
-    d = sub(target, p)
-    distance = length(d)
-    return scale(d, 1.0 / max(distance, 1e-12)), distance
-
-
-@inlined
 def _on_disk(centre: Vec, x: Vec, y: Vec, radius: float, u1: float, u2: float) -> Vec:
     """A point spread evenly over a disk's area, for which its distance from the middle grows as a square root."""
     r = radius * math.sqrt(u1)
@@ -273,13 +266,13 @@ def _sphere_target(lamp: Lamp, p: Vec, n: Vec, u1: float, u2: float) -> tuple[Ve
     if lamp.a > 0.0:
         x, y = frame(normalize(sub(p, lamp.centre)))
         target = _on_disk(lamp.centre, x, y, lamp.a, u1, u2)
-    return _towards(p, target)
+    return towards(p, target)
 
 
 @inlined
 def _rect_target(lamp: Lamp, p: Vec, n: Vec, u1: float, u2: float) -> tuple[Vec, float]:
     across = add(scale(lamp.x, (2.0 * u1 - 1.0) * lamp.a), scale(lamp.y, (2.0 * u2 - 1.0) * lamp.b))
-    return _towards(p, add(lamp.centre, across))
+    return towards(p, add(lamp.centre, across))
 
 
 @inlined
@@ -287,7 +280,7 @@ def _disk_target(lamp: Lamp, p: Vec, n: Vec, u1: float, u2: float) -> tuple[Vec,
     target = lamp.centre
     if lamp.a > 0.0:
         target = _on_disk(lamp.centre, lamp.x, lamp.y, lamp.a, u1, u2)
-    return _towards(p, target)
+    return towards(p, target)
 
 
 @inlined
@@ -307,7 +300,7 @@ def _cylinder_target(lamp: Lamp, p: Vec, n: Vec, u1: float, u2: float) -> tuple[
     _, _, w = across(lamp, p)
     side = cross(lamp.x, w)
     off = add(scale(lamp.x, (2.0 * u1 - 1.0) * lamp.b), scale(side, (2.0 * u2 - 1.0) * lamp.a))
-    return _towards(p, add(lamp.centre, off))
+    return towards(p, add(lamp.centre, off))
 
 
 @inlined
@@ -324,7 +317,7 @@ def _ball_target(lamp: Lamp, p: Vec, n: Vec, u1: float, u2: float) -> tuple[Vec,
 
 @inlined
 def _camera_target(lamp: Lamp, p: Vec, n: Vec, u1: float, u2: float) -> tuple[Vec, float]:
-    return _towards(p, lamp.centre)
+    return towards(p, lamp.centre)
 
 
 # --- how much of a piece of a light faces a place --------------------------------------------------------------------

@@ -9,7 +9,7 @@ import numpy as np
 from ..kernels.compile import inlined
 from ..kernels.lanes import LANES, Scalars, Vectors, put
 from ..kernels.sampling import chance_of_bits, hash32
-from ..kernels.vec import Vec, along, dot, length, mul, row, scale, sub
+from ..kernels.vec import Vec, along, dot, mul, row, scale, towards
 from ..optics.interface import fresnel_dielectric, transmittance
 from ..optics.models import absorption_distance_of, exit_of, is_sheet, thickness_of
 from ..scene import Param
@@ -130,9 +130,7 @@ def add_shadow_ray(packet: Packet, lane: int, point: Vec, ng: Vec, direction: Ve
     """
     start = off_surface(point, ng, direction)
     if distance < math.inf:
-        way = sub(along(point, direction, distance), start)
-        distance = length(way)
-        direction = scale(way, 1.0 / max(distance, 1e-12))
+        direction, distance = towards(start, along(point, direction, distance))
     set_ray(packet, lane, start, direction, 0.0, short_of(distance), SOLID)
 
 

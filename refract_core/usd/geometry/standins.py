@@ -40,18 +40,10 @@ _CORNERS = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
 """Their s and t, counter-clockwise seen from outside."""
 
 
-def own_mode(prim: Usd.Prim, above: str) -> str:
-    """The draw mode that holds at a prim and is handed to its children."""
-    attribute = prim.GetAttribute("model:drawMode")
-    said = attribute.Get() if attribute else None
-    return above if said in (None, INHERITED) else str(said)
-
-
-def own_cards(prim: Usd.Prim, above: str) -> str:
-    """Its `model:cardVisibility` likewise."""
-    attribute = prim.GetAttribute("model:cardVisibility")
-    said = attribute.Get() if attribute else None
-    return above if said in (None, INHERITED) else str(said)
+def handed_down(prim: Usd.Prim, name: str, above: str) -> str:
+    """A `model:` attribute, `drawMode` or `cardVisibility`, that holds at a prim and is handed to its children."""
+    said = str(_said(prim, name, INHERITED))
+    return above if said == INHERITED else said
 
 
 def takes(prim: Usd.Prim) -> bool:

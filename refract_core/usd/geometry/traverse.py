@@ -13,7 +13,7 @@ from ...errors import StageError
 from ...scene import F64, I32, Notice, Run
 from .gprims import ATTRIBUTES
 from .moving import FLIGHT, flies
-from .standins import INHERITED, MODES, StandIns, own_cards, own_mode, takes
+from .standins import INHERITED, MODES, StandIns, handed_down, takes
 from .triangulate import Index
 
 MAX_INSTANCES = 4_000_000
@@ -107,15 +107,14 @@ class _Walk:
     cache: UsdGeom.XformCache
     unsupported: dict[str, list[str]] = field(default_factory=dict)
     stand_ins: StandIns | None = None
-    """What is drawn for models whose draw mode asks for bounds, an origin or cards; None: the models themselves"""
+    """What is drawn for models whose draw mode asks for bounds, an origin or cards; None: the models themselves, and no
+    lights of point instancers"""
     drawn_otherwise: dict[str, list[str]] = field(default_factory=dict)
     """Those models, by their draw mode."""
     visited: int = 0
     expanded: int = 0
     within: tuple[Sdf.Path, ...] = ()
     """Point instancers being expanded, outermost first."""
-    lights: bool = False
-    """Lights of point instancers are among what is found."""
 
 
 def walk(
@@ -132,7 +131,7 @@ def walk(
         StageError: where instances expand to more than `MAX_INSTANCES` or `MAX_PRIMS` prims.
     """
     state = _Walk(time, frozenset(purposes), notices, UsdGeom.XformCache(time))
-    state.stand_ins, state.lights = StandIns(stage, notices) if as_drawn else None, as_drawn
+    state.stand_ins = StandIns(stage, notices) if as_drawn else None
     start = _Node(stage.GetPseudoRoot(), Gf.Matrix4d(1.0), UsdGeom.Imageable.PurposeInfo(), True)
     found = list(_descend(state, start, Usd.TraverseInstanceProxies(), 0))
     for kind, paths in sorted(state.unsupported.items()):
@@ -218,7 +217,7 @@ def _descend(
                 yield Placement(prim, Run((label,), _ONE), np.array(here.world).T[None, :3], here.static)
             else:
                 state.unsupported.setdefault(kind, []).append(label)
-        elif state.lights and state.within and prim.HasAPI(UsdLux.LightAPI) and _wanted(state, here):
+        elif state.stand_ins is not None and state.within and prim.HasAPI(UsdLux.LightAPI) and _wanted(state, here):
             yield Placement(prim, Run((label,), _ONE), np.array(here.world).T[None, :3], here.static)
         children = prim.GetFilteredChildren(predicate)
         stack.extend(here._replace(prim=child) for child in reversed(children))
@@ -236,7 +235,7 @@ def _enter(state: _Walk, node: _Node, *, moves: bool) -> _Node:
         world = local if resets else local * world
         static = static and not xformable.TransformMightBeTimeVarying()
     if state.stand_ins is not None:
-        mode, cards = own_mode(prim, mode), own_cards(prim, cards)
+        mode, cards = handed_down(prim, "drawMode", mode), handed_down(prim, "cardVisibility", cards)
     said = prim.GetAttribute("primvars:refract:static")
     if said and said.HasAuthoredValue():
         static = bool(said.Get(state.time)) and static
@@ -321,7 +320,7 @@ def _modes_above(prim: Usd.Prim) -> tuple[str, str]:
     mode, cards = INHERITED, INHERITED
     for path in prim.GetPath().GetParentPath().GetPrefixes():
         above = prim.GetStage().GetPrimAtPath(path)
-        mode, cards = own_mode(above, mode), own_cards(above, cards)
+        mode, cards = handed_down(above, "drawMode", mode), handed_down(above, "cardVisibility", cards)
     return mode, cards
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -37,10 +37,7 @@ def own_glows(stage: Usd.Stage) -> dict[str, Usd.Prim]:
     What `light:materialSyncMode` leaves to the bound material shows that: its own glow, whatever the light says. A mesh
     without material has nothing to tint, so it glows as the light says.
     """
-    return {
-        str(path): light for light in _every(stage) for path in _targets(light)
-        if _own_glow(stage.GetPrimAtPath(path), light)
-    }  # fmt: skip
+    return _own_glows(stage, _every(stage))
 
 
 def glowing(
@@ -54,10 +51,11 @@ def glowing(
     """
     context = _context(time, metres_per_unit, notices)
     drawn = {prim_of(mesh.path) for mesh in meshes} | set(instanced)
-    for light in _every(stage):
+    every = list(_every(stage))
+    for light in every:
         if not any(str(path) in drawn for path in _targets(light)):
             note(context, light, f"{light.GetTypeName()} has no mesh that is drawn, so it gives no light")
-    lights = own_glows(stage)
+    lights = _own_glows(stage, every)
     if not lights:
         return meshes
     return tuple(_lit(context, mesh, lights.get(prim_of(mesh.path)), materials) for mesh in meshes)
@@ -65,6 +63,13 @@ def glowing(
 
 def _every(stage: Usd.Stage) -> Iterator[Usd.Prim]:
     return filter(is_mesh_light, Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
+
+
+def _own_glows(stage: Usd.Stage, lights: Iterable[Usd.Prim]) -> dict[str, Usd.Prim]:
+    return {
+        str(path): light for light in lights for path in _targets(light)
+        if _own_glow(stage.GetPrimAtPath(path), light)
+    }  # fmt: skip
 
 
 def _targets(prim: Usd.Prim) -> Sequence[Sdf.Path]:
