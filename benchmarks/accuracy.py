@@ -23,7 +23,6 @@ import argparse
 import math
 import statistics
 import sys
-import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -34,10 +33,11 @@ from refract_core.errors import RefractError
 from refract_core.images.frame import Frame
 from refract_core.scene import Scene
 from refract_core.settings import RenderSettings
+from refract_core.usd.layers.write import GLTF
 from refract_core.usd.settings import read_settings
 from refract_core.usd.stage import open_stage, scene_from_stage
 from refract_core.verbs.compare import Mask, displayed, psnr
-from refract_core.verbs.convert import GLTF, ConvertOrder, convert
+from refract_core.verbs.gltf import as_usd
 from refract_core.verbs.render_files import chosen_settings
 
 from . import pages
@@ -124,28 +124,21 @@ def samples() -> list[Stage]:
     return [Stage(path.stem, path) for path in sorted(SAMPLES.glob("*.usda"))]
 
 
-def assets(folder: Path, converted: Path) -> Iterator[Stage]:
+def assets(folder: Path) -> Iterator[Stage]:
     """Stages in a folder that show glass, by their place in it.
 
     Args:
         folder: searched through and through.
-        converted: an empty folder for what has to be converted first.
     """
     for path in sorted(folder.rglob("*")):
         try:
-            stage = path if path.suffix in _USD else _converted(path, converted) if path.suffix in GLTF else None
-            if stage is not None and _shows_glass(stage):
+            if path.suffix not in _USD + GLTF:
+                continue
+            stage = Path(as_usd(str(path)))
+            if _shows_glass(stage):
                 yield Stage(str(path.relative_to(folder)), stage)
         except RefractError as error:
             print(f"left out {path.relative_to(folder)}: {error}", file=sys.stderr)
-
-
-def _converted(path: Path, folder: Path) -> Path:
-    """A glTF file as a stage of its own."""
-    out = folder / str(len([*folder.iterdir()])) / f"{path.stem}.usda"
-    out.parent.mkdir()
-    convert(ConvertOrder(stage=str(path), out=str(out)))
-    return out
 
 
 def _shows_glass(path: Path) -> bool:
@@ -271,17 +264,16 @@ def main() -> None:
         parser.error("--write makes whole tables; leave out --stages")
     names = set(chosen.stages.split(",")) if chosen.stages else None
     options = Options(chosen.image_width, chosen.reference_samples, chosen.jobs)
-    with tempfile.TemporaryDirectory() as folder:
-        groups: dict[str, list[Stage]] = {"samples": samples(), "assets": []}
-        if not names or names - {stage.name for stage in groups["samples"]}:
-            groups["assets"] = [*assets(chosen.assets, Path(folder))]
-        if names and (unknown := names - {stage.name for group in groups.values() for stage in group}):
-            parser.error(f"--stages has {', '.join(sorted(unknown))}, which are not there")
-        warm_up(options)
-        found = {
-            group: _measured([one for one in stages if not names or one.name in names], options)
-            for group, stages in groups.items()
-        }
+    groups: dict[str, list[Stage]] = {"samples": samples(), "assets": []}
+    if not names or names - {stage.name for stage in groups["samples"]}:
+        groups["assets"] = [*assets(chosen.assets)]
+    if names and (unknown := names - {stage.name for group in groups.values() for stage in group}):
+        parser.error(f"--stages has {', '.join(sorted(unknown))}, which are not there")
+    warm_up(options)
+    found = {
+        group: _measured([one for one in stages if not names or one.name in names], options)
+        for group, stages in groups.items()
+    }
     blocks = {group: block(rows, options) for group, rows in found.items() if rows}
     print("\n\n".join(blocks.values()))
     if chosen.write:

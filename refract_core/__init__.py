@@ -32,10 +32,9 @@ if TYPE_CHECKING:
     from .rendering.session import Session
     from .scene import Notice, Scene
     from .settings import Opening, RenderSettings
-    from .usd.stage import load_stage
     from .verbs.override import OverrideError, override
     from .verbs.samples import sample
-    from .verbs.table import bake_probes, bake_thickness, compare, convert, inspect, validate
+    from .verbs.table import bake_probes, bake_thickness, compare, convert, inspect, load_stage, validate
 
 __all__ = [
     "Cancelled",
@@ -88,7 +87,7 @@ _ROOMS = {
     "compare": "verbs.table",
     "convert": "verbs.table",
     "inspect": "verbs.table",
-    "load_stage": "usd.stage",
+    "load_stage": "verbs.table",
     "override": "verbs.override",
     "refract_node": "optics.arrays",
     "render": "rendering.picture",

@@ -12,10 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 from material_reading import write_png
+from numpy.testing import assert_array_equal
 from numpy.typing import NDArray
 from test_convert import material, plain, run
+from typer.testing import CliRunner
 
+import refract_core as rc
+from refract_core.cli import app
 from refract_core.errors import StageError, UsageError
+from refract_core.images.pictures import read_planes
 from refract_core.scene import Mesh, Model, Param
 from refract_core.usd.convert.gltf_file import read_gltf
 from refract_core.usd.geometry.gprims import Solid, _unit_cube, _unit_plane, unit_sphere
@@ -216,6 +221,80 @@ def test_what_cannot_be_read_says_so(tmp_path: Path) -> None:
     made.document["nodes"][1]["children"] = [0]
     with pytest.raises(StageError, match="circle"):
         run(made.glb(tmp_path / "circle.glb"), out)
+    assert not out.exists()
+
+
+PERSPECTIVE = {"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.1}}
+POINT = {"extensions": {"KHR_lights_punctual": {"light": 1}}}
+
+
+@pytest.mark.parametrize(
+    ("node", "document", "said"),
+    [
+        ({"mesh": 9}, {}, "mesh 9, and has 4"),
+        ({"children": [7]}, {}, "node 7, and has 6"),
+        ({"children": [-1]}, {}, "node -1, and has 6"),
+        ({"camera": 1}, {"cameras": [PERSPECTIVE]}, "camera 1, and has 1"),
+        ({"camera": 0}, {}, "camera 0, and has 0"),
+        ({"camera": 0}, {"cameras": [{}]}, "type None"),
+        ({"camera": 0}, {"cameras": [{**PERSPECTIVE, "type": "orthographic"}]}, "with its lens"),
+        ({"camera": 0}, {"cameras": [{"type": "perspective", "perspective": {"yfov": 4, "znear": 0.1}}]}, "yfov is 4"),
+        ({"camera": 0}, {"cameras": [{**PERSPECTIVE, "perspective": {"yfov": 1, "znear": 2, "zfar": 1}}]}, "nothing"),
+        (POINT, {"extensions": {"KHR_lights_punctual": {"lights": [{"type": "point"}]}}}, "light 1, and has 1"),
+        (POINT, {}, "light 1, and has 0"),
+        ({}, {"textures": [{"source": 3}]}, "image 3, and has 1"),
+        ({}, {"textures": []}, "texture 0, and has 0"),
+        ({}, {"materials": MATERIALS[:3]}, "material 3, and has 3"),
+        ({}, {"scenes": [{"nodes": [6]}]}, "node 6, and has 6"),
+    ],
+)  # fmt: skip
+def test_what_is_asked_for_and_not_there_is_named(
+    tmp_path: Path, node: dict[str, Any], document: dict[str, Any], said: str
+) -> None:
+    made = shop(tmp_path)
+    made.document["nodes"][0]["children"].append(made.node(**node))
+    made.document |= document
+    with pytest.raises(StageError, match=said):
+        run(made.glb(tmp_path / "odd.glb"), tmp_path / "out.usda")
+
+
+def test_a_file_is_drawn_without_being_converted_first(tmp_path: Path) -> None:
+    """By the command, in Python, and to the pixel as what `convert` makes of it."""
+    glb = shop(tmp_path).glb(tmp_path / "shop.glb")
+    run(glb, tmp_path / "shop.usdz")
+    small = ["--image-width", "24", "--samples", "1"]
+    for name in ("shop.glb", "shop.usdz"):
+        done = CliRunner().invoke(app, ["render", str(tmp_path / name), str(tmp_path / f"{name}.exr"), *small])
+        assert done.exit_code == 0, done.output
+    one, other = (read_planes(str(tmp_path / f"{name}.exr")) for name in ("shop.glb", "shop.usdz"))
+    assert_array_equal(one["beauty"], other["beauty"])
+    assert [mesh.path for mesh in rc.load_stage(glb).meshes] == [
+        mesh.path for mesh in rc.load_stage(tmp_path / "shop.usdz").meshes
+    ]
+    assert rc.validate(glb).passed
+    assert rc.inspect(glb)["glass"]
+
+
+def test_what_a_file_has_and_a_stage_has_not_is_told(tmp_path: Path) -> None:
+    made = shop(tmp_path)
+    made.document["skins"] = [{"joints": [0]}]
+    assert any("skins" in one.text for one in rc.load_stage(made.glb(tmp_path / "shop.glb")).notices)
+
+
+def test_a_file_that_changed_is_read_anew(tmp_path: Path) -> None:
+    made = shop(tmp_path)
+    assert len(rc.load_stage(made.glb(tmp_path / "shop.glb")).meshes) == 4
+    made.document["nodes"][0]["children"].pop()
+    assert len(rc.load_stage(made.glb(tmp_path / "shop.glb")).meshes) == 3
+
+
+@pytest.mark.parametrize("verb", ["bake thickness", "bake probes", "validate --fix"])
+def test_a_layer_over_gltf_says_how_to_make_a_stage(tmp_path: Path, verb: str) -> None:
+    glb, out = shop(tmp_path).glb(tmp_path / "shop.glb"), tmp_path / "over.usda"
+    words = ["validate", glb, "--fix", str(out)] if verb.startswith("validate") else [*verb.split(), glb, str(out)]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 1
+    assert f"refract convert {glb} shop.usdz" in " ".join(done.output.split())
     assert not out.exists()
 
 

@@ -104,8 +104,8 @@ def only_option(what: str) -> Any:
 
 def stages_argument(what: str) -> Any:
     """STAGE of the commands that take several (`verbs.validate_many.stages_named`)."""
-    help_text = f"The .usd, .usda, .usdc or .usdz files to {what}. A folder means every such file below it."
-    return typer.Argument(metavar="STAGE", help=help_text)
+    of_folder = "A folder means every USD file below it."
+    return typer.Argument(metavar="STAGE", help=f"The .usd, .usda, .usdc, .usdz or .glb files to {what}. {of_folder}")
 
 
 AsJson = Annotated[bool, typer.Option("--json", help="The same as --format json.")]

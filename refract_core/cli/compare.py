@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 SAMPLES = 64
 """Of the reference, where nobody says."""
-STAGES = (".usd", ".usda", ".usdc", ".usdz")
+STAGES = (".usd", ".usda", ".usdc", ".usdz", ".glb", ".gltf")
 
 First = Annotated[
     str, typer.Argument(metavar="STAGE|A", help="A stage to draw, or a picture: .exr with its AOVs, .png, .jpg, .tif.")

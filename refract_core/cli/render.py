@@ -19,7 +19,8 @@ from .orbit import Azimuth, Distance, Elevation, Fit, FocalLength, Fov, LookAt, 
 from .stdout import written_to
 
 Stage = Annotated[
-    str, typer.Argument(metavar="STAGE", help="The .usd, .usda, .usdc or .usdz file to render, or a .mtlx file.")
+    str,
+    typer.Argument(metavar="STAGE", help="The .usd, .usda, .usdc, .usdz, .glb, .gltf or .mtlx file to render."),
 ]
 Out = Annotated[
     str,

@@ -33,6 +33,7 @@ from .geometry.standins import ROOT
 from .geometry.traverse import POINTS, Placement, refuse_too_many, some_of, told_of, walk
 from .geometry.ways import with_ways
 from .layers import mtlx
+from .layers.write import is_gltf
 from .lights.meshes import glow_of, glowing, mesh_lights, own_glows
 from .lights.read import read_lights
 from .opening import mask_of, open_as
@@ -75,6 +76,8 @@ def open_stage(path: str | os.PathLike[str], opening: Opening = AS_IT_IS) -> Usd
         raise StageError(f"{name or 'the stage path'}: there is no such file; check the path")
     if file.is_dir():
         raise StageError(f"{name}: is a folder; name a .usd, .usda, .usdc or .usdz file in it")
+    if is_gltf(name):
+        raise StageError(f"{name}: is glTF, not USD; `refract convert {name} {file.stem}.usdz` makes a stage of it")
     if file.suffix.lower() == ".usdz" and not zipfile.is_zipfile(file):  # USD may open what is left as an empty stage
         reason = "the package has no directory at its end, so it was cut off; copy or pack it again"
         raise StageError(f"{name}: cannot be read as .usd, .usda, .usdc or .usdz: {reason}")
@@ -115,7 +118,7 @@ def load_stage(
     complexity: str = "low",
     opening: Opening = AS_IT_IS,
 ) -> Scene:
-    """Reads a stage at one time.
+    """Reads a stage at one time, of any file but glTF, which `verbs.table.load_stage` reads as well.
 
     Args:
         path: of a file; or a stage that is open, or a layer as the root of one, with what was edited and not saved.

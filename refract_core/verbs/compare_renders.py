@@ -102,6 +102,7 @@ def compare_stage(order: CompareOrder, report: Report, cancel: Callable[[], bool
     from ..usd.layers.write import check_out
     from ..usd.settings import read_settings
     from ..usd.stage import open_stage, scene_from_stage
+    from .gltf import as_usd
     from .suggest import MADE, suggest
 
     chosen_settings({}, order.overrides)
@@ -109,7 +110,7 @@ def compare_stage(order: CompareOrder, report: Report, cancel: Callable[[], bool
     if order.write:
         check_out(order.stage, order.write, overwrite=order.overwrite, ours=MADE)
     report.progress(0.0, "reading the stage")
-    stage = open_stage(order.stage, order.opening)
+    stage = open_stage(order.stage if order.suggest else as_usd(order.stage, report.warning), order.opening)
     notices: list[Notice] = []
     # A studio is not invented here: it would stand in the picture as in the reference, and hide what a stage lacks.
     bare = {"studio": "none"}

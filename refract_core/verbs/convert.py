@@ -24,14 +24,13 @@ from ..usd.convert.gltf_write import write_gltf
 from ..usd.convert.mtlx_write import write_mtlx
 from ..usd.convert.standard import write_surfaces
 from ..usd.convert.uses import Use, find_uses
-from ..usd.layers.write import EXTENSIONS, check_out, save
+from ..usd.layers.write import EXTENSIONS, GLTF, check_out, is_gltf, save
 from ..usd.thickness.find import stage_of
 from ..usd.values import neat
 from .orders import make_folder_of, refuse_existing, select, stop_if
 
 THICKNESS = ("typed", "measured")
 TARGETS = ("preview", "openpbr", "gltf", "mtlx")
-GLTF = (".glb", ".gltf")
 MTLX = ".mtlx"
 
 
@@ -191,7 +190,7 @@ def _export(order: ConvertOrder, work: Work, folder: str) -> tuple[_Told, tuple[
 
 def _look(order: ConvertOrder, pictures: str) -> tuple[Work, list[Glass], dict[str, bytes]]:
     """The stage with its glass, and the pictures that belong beside it: path and content."""
-    if order.stage.lower().endswith(GLTF):
+    if is_gltf(order.stage):
         if order.opening != AS_IT_IS:
             flags = "--variant, --session-layer and --mask"
             raise UsageError(f"{flags} change how a USD stage is opened, and {order.stage} is none; leave them out")

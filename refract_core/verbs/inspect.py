@@ -46,6 +46,7 @@ from ..usd.rules.probes import share
 from ..usd.values import neat
 from ..version import __version__
 from ..world.solid import crossings
+from .gltf import as_usd
 from .orders import stop_if
 from .validate import SEVERITIES, finding_record
 
@@ -65,7 +66,7 @@ def inspect(stage: str, cancel: Callable[[], bool] = lambda: False, opening: Ope
     Raises:
         StageError: the stage cannot be opened.
     """
-    seen = overview_of(stage, opening)
+    seen = overview_of(as_usd(stage), opening)
     stop_if(cancel)
     scene = seen.scene
     shares = [[(probe.path, share(probe, piece)) for probe in scene.probes] for piece in seen.glass]

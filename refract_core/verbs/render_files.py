@@ -221,6 +221,7 @@ def _render_jobs(
     from ..usd.products import read_products
     from ..usd.settings import read_settings
     from ..usd.stage import open_stage, scene_from_stage
+    from .gltf import as_usd
 
     told: set[Notice] = set()
     empty = stopped = False
@@ -235,7 +236,7 @@ def _render_jobs(
                 report.warning(notice.path, notice.text)
 
     report.progress(0.0, _READING)
-    stage = open_stage(order.stage, order.opening)
+    stage = open_stage(as_usd(order.stage, report.warning), order.opening)
     found: list[Notice] = []
     authored = read_settings(stage, order.settings_prim, found, products=True)
     products = read_products(stage, order.settings_prim, found)

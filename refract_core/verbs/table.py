@@ -11,16 +11,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from ..errors import UsageError
 from ..images.frame import Frame
 from ..progress import Report
-from ..scene import Notice
+from ..scene import Notice, Scene
 from ..settings import AS_IT_IS, Opening
 
 if TYPE_CHECKING:
+    from pxr import Sdf, Usd
+
     from . import bake_thickness as thickness_room
     from .compare_report import Account
     from .convert import Converted
@@ -38,6 +40,41 @@ class Baked(NamedTuple):
     files: dict[str, str]
     """path -> what became of it, OUT last"""
     notices: tuple[Notice, ...]
+
+
+def load_stage(
+    path: Path | Usd.Stage | Sdf.Layer,
+    *,
+    time_code: float | None = None,
+    purposes: tuple[str, ...] = ("default", "render"),
+    camera: str = "",
+    complexity: str = "low",
+    opening: Opening = AS_IT_IS,
+) -> Scene:
+    """Read a stage at one time; of a .mtlx file, balls of its materials; of glTF, what `convert` makes of it.
+
+    Args:
+        path: of a file; or a stage that is open, or a layer as the root of one, with what was edited and not saved.
+            They are not changed, and how a stage is loaded, masked and muted is as its owner has it.
+        time_code: None takes the stage's startTimeCode, or 0 where it has none.
+        purposes: which of default, render, proxy and guide are drawn.
+        camera: prim path or name of the camera that `Scene.cameras` begins with; '' chooses one.
+        complexity: how fine subdivision surfaces are: low, medium, high or veryhigh.
+        opening: session layer, variants and mask; of files, for an open stage is its owner's to change.
+
+    Raises:
+        StageError: the stage cannot be opened or read.
+        UsageError: it has no such camera, there is no such complexity, the opening asks for what is not there, glTF
+            needs an extra that is not installed, or `path` is none of the three.
+    """
+    from ..usd.stage import load_stage as of_usd
+    from .gltf import as_usd
+
+    lost: list[Notice] = []
+    if isinstance(path, str | os.PathLike):
+        path = as_usd(os.fspath(path), lambda where, text: lost.append(Notice(where, text)))
+    scene = of_usd(path, time_code=time_code, purposes=purposes, camera=camera, complexity=complexity, opening=opening)
+    return replace(scene, notices=(*lost, *scene.notices)) if lost else scene
 
 
 def convert(stage: Path, out: Path, *, progress: Progress | None = None, cancel: Cancel | None = None,

@@ -28,6 +28,7 @@ from ..usd.rules.findings import Finding, apply_repairs
 from ..usd.rules.stage import stage_findings, stock_findings
 from ..usd.stage import open_stage
 from ..version import __version__
+from .gltf import as_usd
 from .orders import stop_if
 
 FORMAT = "refract.validate/1"
@@ -79,7 +80,7 @@ def validate(order: ValidateOrder, cancel: Callable[[], bool] = lambda: False) -
     """
     if order.fix:
         check_out(order.stage, order.fix, overwrite=order.overwrite, ours=MADE)
-    found = _check(order.stage, order.opening, cancel)
+    found = _check(order.stage if order.fix else as_usd(order.stage), order.opening, cancel)
     if not order.fix:
         return Verdict(order.stage, found)
     layer = overlay(order.stage, made=MADE)

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import unquote
 
 import numpy as np
@@ -20,6 +21,10 @@ from ...errors import StageError, UsageError
 from ...scene import F32, F64, I32, Notice
 from .gltf_lamps import EXTENSION, Lamp, View, read_lamp, read_view
 
+T = TypeVar("T")
+
+NONE = -1
+"""In place of a number that a file does not have."""
 _KINDS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _WRAPS = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
@@ -78,7 +83,7 @@ class Primitive:
     triangles: I32
     """shape (T, 3)"""
     material: int
-    """-1: none"""
+    """or NONE"""
     normals: F32 | None = None
     uvs: dict[int, F32] = field(default_factory=dict)
     """Set -> shape (V, 2), v downwards as in the file"""
@@ -88,15 +93,15 @@ class Primitive:
 
 @dataclass(frozen=True)
 class Node:
-    """A place in the hierarchy, with a mesh, a camera and a light (-1: none) and what hangs below it."""
+    """A place in the hierarchy, with a mesh, a camera and a light, each or NONE, and what hangs below it."""
 
     name: str
     matrix: F64
     """shape (4, 4), column vectors: parent from node"""
     mesh: int
     children: tuple[int, ...]
-    camera: int = -1
-    light: int = -1
+    camera: int = NONE
+    light: int = NONE
 
 
 @dataclass(frozen=True)
@@ -162,7 +167,7 @@ def _read(file: _File) -> Gltf:
     roots = scenes[document.scene or 0].nodes if scenes else sorted(set(range(len(document.nodes))) - set(children))
     if len(set(children)) < len(children) or set(children) & set(roots or ()):
         raise ValueError("a node has two parents, or nodes stand in a circle")
-    return Gltf(
+    all_of_it = Gltf(
         nodes=tuple(_node(node, number) for number, node in enumerate(document.nodes)),
         roots=tuple(roots or ()),
         meshes=tuple((mesh.name or "Mesh", _primitives(file, mesh)) for mesh in document.meshes),
@@ -172,6 +177,29 @@ def _read(file: _File) -> Gltf:
         images=tuple(_image(file, number) for number in range(len(document.images))),
         notices=tuple(dict.fromkeys(file.notices)),
     )
+    _check(all_of_it)
+    return all_of_it
+
+
+def _check(gltf: Gltf) -> None:
+    """Raises ValueError where a node or a mesh asks for what the file does not have."""
+    for number in (*gltf.roots, *(child for node in gltf.nodes for child in node.children)):
+        _entry(gltf.nodes, number, "node")
+    for node in gltf.nodes:
+        for number, entries, kind in (
+            (node.mesh, gltf.meshes, "mesh"), (node.camera, gltf.cameras, "camera"), (node.light, gltf.lights, "light"),
+        ):  # fmt: skip
+            if number != NONE:
+                _entry(entries, number, kind)
+    for number in {one.material for _, primitives in gltf.meshes for one in primitives} - {NONE}:
+        _entry(gltf.materials, number, "material")
+
+
+def _entry(entries: Sequence[T] | None, number: Any, kind: str) -> T:
+    """What a number of the file stands for. Raises ValueError where it has no such thing."""
+    if not 0 <= number < len(entries or ()):
+        raise ValueError(f"it asks for {kind} {number}, and has {len(entries or ())}, counted from 0")
+    return (entries or ())[number]
 
 
 def _say(file: _File, text: str) -> None:
@@ -200,9 +228,9 @@ def _uri(file: _File, uri: str) -> bytes:
 
 def _view(file: _File, number: int) -> tuple[bytes, int]:
     """Content of a buffer view, and its stride (0: none given)."""
-    view = file.document.bufferViews[number]
+    view = _entry(file.document.bufferViews, number, "bufferView")
     if view.buffer not in file.buffers:
-        uri = file.document.buffers[view.buffer].uri
+        uri = _entry(file.document.buffers, view.buffer, "buffer").uri
         file.buffers[view.buffer] = _uri(file, uri) if uri else bytes(file.document.binary_blob() or b"")
     start = view.byteOffset or 0
     content = file.buffers[view.buffer][start : start + view.byteLength]
@@ -213,7 +241,7 @@ def _view(file: _File, number: int) -> tuple[bytes, int]:
 
 def _accessor(file: _File, number: int) -> NDArray[Any]:
     """Values as stored, shape (N, width); normalised integers as float32."""
-    accessor = file.document.accessors[number]
+    accessor = _entry(file.document.accessors, number, "accessor")
     kind, width = np.dtype(_KINDS[accessor.componentType]).newbyteorder("<"), _WIDTHS[accessor.type]
     if not 0 <= accessor.count <= _LARGEST:
         raise ValueError(f"accessor {number} has {accessor.count} elements")
@@ -272,7 +300,7 @@ def _primitive(file: _File, primitive: Any) -> Primitive:
             uvs[number] = _accessor(file, place).astype(np.float32)
     colors = None if attributes.COLOR_0 is None else _accessor(file, attributes.COLOR_0).astype(np.float32)[:, :3]
     normals = None if attributes.NORMAL is None else _accessor(file, attributes.NORMAL).astype(np.float32)
-    material = -1 if primitive.material is None else int(primitive.material)
+    material = NONE if primitive.material is None else int(primitive.material)
     return Primitive(points, triangles.astype(np.int32), material, normals, uvs, colors)
 
 
@@ -327,16 +355,18 @@ def _material(file: _File, material: Any, number: int) -> GltfMaterial:
 def _picture(file: _File, info: Any) -> Picture:
     """A textureInfo; those of extensions are dictionaries."""
     get = info.get if isinstance(info, dict) else lambda name, default=None: getattr(info, name, default)
-    texture = file.document.textures[get("index")]
+    texture = _entry(file.document.textures, get("index"), "texture")
     moved = (get("extensions") or {}).get("KHR_texture_transform", {})
     wrap = ("repeat", "repeat")
+    if texture.source is not None:
+        _entry(file.document.images, texture.source, "image")
     if texture.sampler is not None:
-        sampler = file.document.samplers[texture.sampler]
+        sampler = _entry(file.document.samplers, texture.sampler, "sampler")
         wrap = _WRAPS.get(sampler.wrapS or 10497, "repeat"), _WRAPS.get(sampler.wrapT or 10497, "repeat")
     u, v = moved.get("offset", (0.0, 0.0))
     x, y = moved.get("scale", (1.0, 1.0))
     return Picture(
-        image=-1 if texture.source is None else int(texture.source),
+        image=NONE if texture.source is None else texture.source,
         uv_set=int(moved.get("texCoord", get("texCoord") or 0)),
         wrap=wrap,
         offset=(float(u), float(v)),
@@ -399,7 +429,7 @@ def _node(node: Any, number: int) -> Node:
         )
         matrix[:3, :3] = turned * np.array(node.scale or (1.0, 1.0, 1.0))
         matrix[:3, 3] = node.translation or (0.0, 0.0, 0.0)
-    mesh = -1 if node.mesh is None else int(node.mesh)
-    camera = -1 if node.camera is None else int(node.camera)
-    light = int((node.extensions or {}).get(EXTENSION, {}).get("light", -1))
+    mesh = NONE if node.mesh is None else int(node.mesh)
+    camera = NONE if node.camera is None else int(node.camera)
+    light = int((node.extensions or {}).get(EXTENSION, {}).get("light", NONE))
     return Node(node.name or f"Node_{number}", matrix, mesh, tuple(node.children or ()), camera, light)

@@ -149,15 +149,21 @@ def read_lamp(found: dict[str, Any]) -> Lamp:
 
 
 def read_view(found: Any) -> View:
-    """A camera of pygltflib. Raises ValueError, TypeError, AttributeError where it is none."""
+    """A camera of pygltflib. Raises ValueError, TypeError where it is none."""
+    lens = {"perspective": found.perspective, "orthographic": found.orthographic}.get(found.type)
+    if lens is None:
+        raise ValueError(f"a camera is of type {found.type!r}; it must be perspective or orthographic, with its lens")
     if found.type == "orthographic":
-        lens = found.orthographic
         window = float(lens.xmag), float(lens.ymag)
     else:
-        lens = found.perspective
+        if not 0.0 < float(lens.yfov) < math.pi:
+            raise ValueError(f"a camera's yfov is {lens.yfov}; it must be between 0 and pi")
         upward = math.tan(float(lens.yfov) / 2.0)
         window = upward * float(lens.aspectRatio or 1.0), upward
-    near, far = float(lens.znear), float(lens.zfar or 1.0e6)  # without zfar it is infinite
+    near, far = float(lens.znear or 0.0), float(lens.zfar or 1.0e6)  # without zfar it is infinite
+    if not (0.0 <= near < far and all(0.0 < side < math.inf for side in window)):
+        wide, high = 2.0 * window[0], 2.0 * window[1]
+        raise ValueError(f"a camera sees {wide:g} by {high:g} from {near:g} to {far:g}, which is nothing")
     return View(window, (near, far), found.type == "orthographic")
 
 

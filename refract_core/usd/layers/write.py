@@ -16,6 +16,7 @@ from .assets import absolute, anchored, copy_of, edit_asset_paths, export, files
 from .package import pack, tiles
 
 EXTENSIONS = (".usd", ".usda", ".usdc", ".usdz")
+GLTF = (".glb", ".gltf")
 RECORD = "refract"
 """Key in customLayerData that says what made a layer (`made`) and over which stage (`stage`)."""
 
@@ -24,6 +25,11 @@ STAYS_BELOW = ("subLayers", "subLayerOffsets", "layerRelocates", "primOrder", "h
 
 
 # --- before the work ---------------------------------------------------------------------------------------------
+
+
+def is_gltf(path: str) -> bool:
+    """A file by its name."""
+    return path.lower().endswith(GLTF)
 
 
 def check_out(
