@@ -229,6 +229,40 @@ def test_samples_of_a_pixel_share_what_is_there_by_chance(behind: bool) -> None:
     assert found.std() < 0.06  # of 16 tosses of a coin it would be .12
 
 
+@pytest.mark.parametrize("layers", [2, 5])
+def test_layers_of_one_mesh_are_there_each_for_itself(layers: int) -> None:
+    """Of what is behind n veils, (1 - c)^n is seen, in every pixel: they are not there together or not at all."""
+    coverage = 0.3
+    veil = material("/veil", OPACITY=coverage, DIFFUSE=0.0, SPECULAR=0.0, IOR=1.0, opacity_presence=True)
+    one = quad("/veils", np.array(CARD) * 2, 0)
+    points = np.concatenate([one.points - np.array([0, 0, 0.2 * k], np.float32) for k in range(layers)])
+    triangles = np.concatenate([one.triangles + np.uint32(4 * k) for k in range(layers)])
+    veils = replace(one, points=points, triangles=triangles, materials=np.tile(one.materials, layers),
+                    primvars={})  # fmt: skip
+    wall = quad("/wall", np.array(CARD) * 4 - [0, 0, 3], 1)
+    found = draw(scene([veils, wall], [veil, material("/m", EMISSIVE=1.0)]), 24, 24, samples=64)["beauty"][..., 0]
+    assert found.mean() == pytest.approx(0.7**layers, abs=0.01)
+    assert np.abs(found - 0.7**layers).max() < 4.01 / 64
+
+
+@pytest.mark.parametrize("coverage", [0.25, 0.7])
+@pytest.mark.parametrize("twice", [False, True])
+def test_the_shadow_of_what_is_there_by_a_share_has_no_grain(coverage: float, twice: bool) -> None:
+    """What is under a veil, or two, gets just that share of the light, at each place."""
+    veil = material("/veil", OPACITY=coverage, opacity_presence=True)
+    floor = quad("/floor", [(-2, 0, 2), (2, 0, 2), (2, 0, -2), (-2, 0, -2)], 0)
+    above = np.array([(-3, 1, 3), (3, 1, 3), (3, 1, -3), (-3, 1, -3)])
+    veils = [quad("/veil", above * (1, y, 1), 1) for y in ((1.0, 1.5) if twice else (1.0,))]
+    lamp = light(LightKind.DISTANT, (0, 5, 0), (0, -1, 0), (0.0, 0.0), 1.0)
+    eye = camera((0, 0.9, 1.5), (0, 0, 0.0), 0.2)
+    white = [material("/floor", DIFFUSE=0.5, SPECULAR=0.0, IOR=1.0), veil]
+    with_veils, without = (
+        draw(scene(things, white, cameras=(eye,), lights=(lamp,)), 16, 16, samples=1)["beauty"][..., 0]
+        for things in ([floor, *veils], [floor])
+    )
+    np.testing.assert_allclose(with_veils, without * (1.0 - coverage) ** len(veils), rtol=1e-4)
+
+
 def test_glass_is_left_out_of_mirrors() -> None:
     """Opaque surfaces reflect the opaque scene only: a mirror shows the room as if the glass were not there."""
     walls, materials = position_room()

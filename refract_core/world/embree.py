@@ -272,6 +272,10 @@ class Packet(NamedTuple):
     """`valid` as the caller of `tracing.intersect_world` set it, while it looks behind cut-outs"""
     chance: Flags
     """1 where the ray of a lane met a surface that is there by chance, or not (`tracing.intersect_world`)"""
+    toss: Scalars
+    """and the number in [0, 1) that decides how far it comes"""
+    through: Scalars
+    """share of the light that the layers on it have left so far"""
     x: Words
     """of the pixel a ray belongs to; with the next two what `tracing` tosses for surfaces that are there by chance"""
     y: Words
@@ -301,6 +305,8 @@ class Packet(NamedTuple):
             tally=np.zeros(1, np.int64),
             asked=np.zeros(LANES, np.int32),
             chance=np.zeros(LANES, np.int32),
+            toss=np.zeros(LANES),
+            through=np.ones(LANES),
             x=np.zeros(LANES, np.int32),
             y=np.zeros(LANES, np.int32),
             sample=np.full(LANES, -1, np.int32),

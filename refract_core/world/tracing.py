@@ -55,25 +55,33 @@ def ray_of(packet: Packet, lane: int) -> Ray:
 
 
 @inlined
-def _absent(world: World, packet: Packet, lane: int) -> bool:
-    """The hit in a lane is a hole of a cut-out material, or the uncovered share of a `presence` one."""
+def _cover(world: World, packet: Packet, lane: int) -> float:
+    """How much of the place hit in a lane is there: 0 or 1 of a cut-out material, its opacity of a `presence` one."""
     hit = hit_in(packet, lane, world.geometry)
     m = hit.material
     if world.materials.cutout[m] == 0:
-        return False
+        return 1.0
     at = interaction(world.geometry, hit, ray_of(packet, lane), 0.0)
     opacity = float_input(world, at, Param.OPACITY.value)
     threshold = world.materials.threshold[m]
     if threshold > 0.0:
-        return opacity < threshold
-    # Coverage as chance. The samples of a pixel take turns, so that together they see as much as is there; a ray that
-    # belongs to none goes by its own bits, so that it is the same wherever it is traced.
+        return 0.0 if opacity < threshold else 1.0
+    return min(max(opacity, 0.0), 1.0)
+
+
+@inlined
+def _toss(world: World, packet: Packet, lane: int) -> float:
+    """What decides for a ray how far it comes through what is there by a share, in [0, 1); after its first such hit.
+
+    The samples of a pixel take turns, so that together they see as much as is there; a ray that belongs to none goes by
+    its own bits, so that it is the same wherever it is traced.
+    """
+    surface = surface_of(world.geometry, hit_in(packet, lane, world.geometry))
     if packet.sample[lane] >= 0:
-        pixel, turn = int(np.int32(hash32(packet.x[lane], packet.y[lane], 0))), packet.sample[lane] * _GOLDEN % 1.0
-        return opacity <= (chance_of_bits(pixel, surface_of(world.geometry, hit), 0) + turn) % 1.0
+        pixel = int(np.int32(hash32(packet.x[lane], packet.y[lane], 0)))
+        return (chance_of_bits(pixel, surface, 0) + packet.sample[lane] * _GOLDEN) % 1.0
     words = packet.words
-    z = words[DIR_Z, lane] ^ surface_of(world.geometry, hit)
-    return opacity <= chance_of_bits(words[DIR_X, lane] ^ words[ORG_X, lane], words[DIR_Y, lane], z)
+    return chance_of_bits(words[DIR_X, lane] ^ words[ORG_X, lane], words[DIR_Y, lane], words[DIR_Z, lane] ^ surface)
 
 
 @inlined
@@ -83,10 +91,20 @@ def belongs_to(packet: Packet, lane: int, x: int, y: int, sample: int) -> None:
 
 
 @inlined
-def _is_by_chance(world: World, packet: Packet, lane: int) -> bool:
-    """The hit in a lane is on a `presence` material."""
-    m = hit_in(packet, lane, world.geometry).material
-    return world.materials.cutout[m] != 0 and world.materials.threshold[m] <= 0.0
+def _is_absent(world: World, packet: Packet, lane: int) -> bool:
+    """The hit in a lane is a hole of a cut-out material, or the ray comes through a `presence` one.
+
+    One toss is for all layers on a ray: it ends where less light than that has been left. So each layer stops what it
+    covers of what came through those before, and of n samples that take turns the right number sees what is behind all.
+    """
+    cover = _cover(world, packet, lane)
+    if cover == 0.0 or cover == 1.0:
+        return cover == 0.0
+    if packet.chance[lane] == 0:
+        packet.chance[lane] = 1
+        packet.toss[lane] = _toss(world, packet, lane)
+    packet.through[lane] *= 1.0 - cover
+    return 1.0 - packet.toss[lane] <= packet.through[lane]
 
 
 @inlined
@@ -98,7 +116,7 @@ def intersect_world(packet: Packet, world: World, far: Scalars, coherent: bool) 
     """
     handle = world.geometry.handle
     for lane in range(LANES):
-        packet.chance[lane] = 0
+        packet.chance[lane], packet.through[lane] = 0, 1.0
     intersect(packet, handle, coherent)
     if not world.cutouts:
         return
@@ -107,9 +125,7 @@ def intersect_world(packet: Packet, world: World, far: Scalars, coherent: bool) 
     for _ in range(_MAX_CUTOUTS):
         again = False
         for lane in range(LANES):
-            absent = has_hit(packet, lane) and _absent(world, packet, lane)
-            if has_hit(packet, lane) and _is_by_chance(world, packet, lane):
-                packet.chance[lane] = 1
+            absent = packet.valid[lane] != 0 and has_hit(packet, lane) and _is_absent(world, packet, lane)
             packet.valid[lane] = 0
             if absent:
                 restart(packet, lane, past(hit_distance(packet, lane)), far[lane])
@@ -167,12 +183,36 @@ def _visible(packet: Packet, world: World, solid: int, cutout: int, seen: Vector
     if world.cutouts:
         for lane in range(LANES):
             packet.words[MASK, lane] = cutout
-        intersect_world(packet, world, packet.ends, SCATTERED)
-        _leave_out_blocked(packet, seen)
+        _pass_cutouts(packet, world, seen)
     if world.glass.walked:
         _look_through_glass(packet, world, seen)
     for lane in range(LANES):
         packet.valid[lane] = packet.shadowed[lane]
+
+
+@inlined
+def _pass_cutouts(packet: Packet, world: World, seen: Vectors) -> None:
+    """Let each cut-out on the segments take the share of light that it covers: of a shadow the mean is wanted, and that
+    is known, so nothing is tossed for and it has no grain."""
+    handle = world.geometry.handle
+    for lane in range(LANES):
+        packet.asked[lane] = packet.valid[lane]
+    intersect(packet, handle, SCATTERED)
+    for _ in range(_MAX_CUTOUTS):
+        again = False
+        for lane in range(LANES):
+            cover = _cover(world, packet, lane) if packet.valid[lane] != 0 and has_hit(packet, lane) else 1.0
+            packet.valid[lane] = 0
+            if cover < 1.0:
+                put(seen, lane, scale(row(seen, lane), 1.0 - cover))
+                restart(packet, lane, past(hit_distance(packet, lane)), packet.ends[lane])
+                again = True
+        if not again:
+            break
+        intersect(packet, handle, SCATTERED)
+    for lane in range(LANES):
+        packet.valid[lane] = packet.asked[lane]
+    _leave_out_blocked(packet, seen)
 
 
 @inlined

@@ -123,7 +123,7 @@ class Oracle:
 
     def _first_opaque(self, sight: Sight, view: View) -> Hit | None:
         hits = self.shader.world.candidates(sight.origin, sight.direction, sight.near, sight.far, OPAQUE)
-        return first(hits, lambda h: self.shader.present(h, sight.origin, sight.direction, view.turn))
+        return first(hits, self.shader.present(sight.origin, sight.direction, view.turn))
 
     def _backdrop(self, sight: Sight, view: View, hit: Hit | None) -> tuple[Vec, float]:
         """Colour and alpha of what stands behind all glass."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 from refract_core.scene import Model, Param, Scene
@@ -55,40 +56,57 @@ class Shader:
 
     def nearest(self, o: Vec, d: Vec, kinds: int, far: float = math.inf) -> Hit | None:
         """First present surface of a ray that starts on one."""
-        return first(self.world.candidates(o, d, NEAR, far, kinds), lambda hit: self.present(hit, o, d, None))
+        return first(self.world.candidates(o, d, NEAR, far, kinds), self.present(o, d, None))
 
-    def present(self, hit: Hit, o: Vec, d: Vec, turn: tuple[int, int, int] | None) -> bool:
-        """A cut-out surface is there where its opacity reaches the threshold; with `presence`, as often as its
-        opacity says. `turn`: of the pixel's own rays and what they become, whose samples are a golden section apart;
-        all others go by their bits, which are rounded on their way."""
+    def cover(self, hit: Hit) -> float:
+        """Share of a place that is there: of a cut-out surface all where its opacity reaches the threshold, or none."""
         m = self.world.material(hit)
         if not m.cutout:
-            return True
-        opacity = number(self.scene, hit._replace(width=0.0), m, Param.OPACITY)
-        if m.opacity_threshold > 0.0:
-            return opacity >= m.opacity_threshold
-        if turn is not None:
-            x, y, k = turn
-            first_turn = sampling.hashed(sampling.hashed(x, y, 0), hit.face.part, 0) / 2**32
-            return opacity > (first_turn + k * (math.sqrt(5.0) - 1.0) / 2.0) % 1.0
-        self.unsure = self.unsure or 0.0 < opacity < 1.0
-        bits = ray_bits(o, d)
-        return opacity > sampling.hashed(bits[0], bits[1], bits[2] ^ hit.face.part) / 2**32
+            return 1.0
+        opacity = clamp(number(self.scene, hit._replace(width=0.0), m, Param.OPACITY))
+        return float(opacity >= m.opacity_threshold) if m.opacity_threshold > 0.0 else opacity
+
+    def present(self, o: Vec, d: Vec, turn: tuple[int, int, int] | None) -> Callable[[Hit], bool]:
+        """Whether what a ray hits is there, asked for one hit after the other, nearest first. What is there by a share
+        lets a ray on as long as more light is left behind it than a number that is tossed at the first such hit.
+        `turn`: of the pixel's own rays and what they become, whose samples are a golden section apart; all others go
+        by their bits, which are rounded on their way."""
+        tossed: list[float] = []
+        left = 1.0
+
+        def there(hit: Hit) -> bool:
+            nonlocal left
+            cover = self.cover(hit)
+            if cover in (0.0, 1.0):
+                return cover == 1.0
+            if not tossed:
+                if turn is not None:
+                    x, y, k = turn
+                    first_turn = sampling.hashed(sampling.hashed(x, y, 0), hit.face.part, 0) / 2**32
+                    tossed.append((first_turn + k * (math.sqrt(5.0) - 1.0) / 2.0) % 1.0)
+                else:
+                    self.unsure = True
+                    bits = ray_bits(o, d)
+                    tossed.append(sampling.hashed(bits[0], bits[1], bits[2] ^ hit.face.part) / 2**32)
+            left *= 1.0 - cover
+            return 1.0 - tossed[0] > left
+
+        return there
 
     def _arrives(self, surface: Surface, d: Vec, distance: float, casters: tuple[str, ...] | None = None) -> Vec:
         """Share of a light's point, straight through all glass on the way: what each wall lets pass, with air on its
         other side, and what bodies absorb between one wall and the next. `casters`: what is opaque and may be in the
         way; None: everything."""
 
-        def stands(hit: Hit) -> bool:
-            named = casters is None or hit.face.shape.path in casters
-            return named and self.present(hit, surface.point, d, None)
-
         o, far = surface.point, distance * (1.0 - 1e-4)
-        if first(self.world.candidates(o, d, NEAR, far, OPAQUE), stands) is not None:
+        uncovered = 1.0
+        for hit in self.world.candidates(o, d, NEAR, far, OPAQUE):
+            if casters is None or hit.face.shape.path in casters:
+                uncovered *= 1.0 - self.cover(hit)
+        if uncovered == 0.0:
             return ZERO
-        share, begun = (1.0, 1.0, 1.0), 0.0
-        for hit in all_present(self.world.candidates(o, d, NEAR, far, GLASS), lambda h: self.present(h, o, d, None)):
+        share, begun = (uncovered, uncovered, uncovered), 0.0
+        for hit in all_present(self.world.candidates(o, d, NEAR, far, GLASS), self.present(o, d, None)):
             m = self.world.material(hit)
             model = Model[self.override.upper()] if self.override else m.model
             sheet = model is Model.THIN or (model is Model.TRACED and hit.face.sheet)

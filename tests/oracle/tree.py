@@ -256,7 +256,7 @@ class Tree:
         return [hit._replace(width=self.spread * (ray.travelled + hit.t)) for hit in hits]
 
     def _present(self, ray: Ray, view: View) -> Callable[[Hit], bool]:
-        return lambda hit: self.shader.present(hit, ray.origin, ray.direction, view.turn)
+        return self.shader.present(ray.origin, ray.direction, view.turn)
 
     def _choice(self, ray: Ray, hit: Hit) -> Choice:
         """Rules 3 to 7."""
