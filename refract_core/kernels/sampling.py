@@ -37,6 +37,8 @@ class Purpose(IntEnum):
     """a candidate of the sky, by its radiance"""
     SHADOW_LENGTH = 7
     """how far a light's shadow reaches"""
+    LIGHT_PICK = 8
+    """which of a light's points"""
     LIGHT = 16
     """a point of light 0; those of the other lights follow"""
 

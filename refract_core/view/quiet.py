@@ -262,7 +262,7 @@ def _find(scratch: QuietScratch, world: World, l: int, x0: int, y0: int, x1: int
                 if aim_light(places, i, lights, l):
                     put(scratch.found, i, (1.0, 1.0, 1.0))
                     if shadows:
-                        if add_light_ray(places, i, lights, l, packet, lane, _net_key(x, y)) > 0.0:
+                        if add_light_ray(places, i, lights, l, packet, lane, _net_key(x, y), False) > 0.0:
                             some = True
                         else:  # it has found no point that counts
                             packet.valid[lane] = 0
@@ -296,7 +296,7 @@ def _share_of_lamp(scratch: QuietScratch, world: World, rays: int, l: int, i: in
         clear(packet)
         for lane in range(min(LANES, rays - first)):
             key = nth(_net_key(x, y), first + lane, rays)
-            scratch.weight[lane, 0] = add_light_ray(scratch.places, i, world.lights, l, packet, lane, key)
+            scratch.weight[lane, 0] = add_light_ray(scratch.places, i, world.lights, l, packet, lane, key, False)
         lamp_visible(packet, world, OPAQUE, l, scratch.free)
         for lane in range(min(LANES, rays - first)):
             weights += scratch.weight[lane, 0]

@@ -23,7 +23,7 @@ from .bounced import bounced_light
 from .caustics import caustic_irradiance
 from .embree import SCATTERED, Packet, clear, has_hit, ray_direction, set_ray
 from .environment import TEXEL_LUMINANCE, EnvironmentTable, direction_pdf, irradiance, prefiltered, sample_direction
-from .lights import LightTable, any_glows, highlight, irradiance_factor, shadow_ray
+from .lights import LightTable, any_glows, highlight, irradiance_factor, picked_shadow_ray, shadow_ray
 from .offsets import off_surface
 from .shaping import shape_matt, shape_mirrored
 from .surface import Interaction, color_input, float_input, hit_in, interaction, normal_input, share_input, thing_of
@@ -280,7 +280,8 @@ def _gather_lights(block: Block, packet: Packet, world: World, mask: int) -> Non
             for lane in range(LANES):
                 if block.lamp_asked[lane] != 0 and k < block.rays[lane]:
                     key = nth(key_of(block.key, lane), k, block.rays[lane])
-                    block.lamp_weight[lane] = add_light_ray(block, lane, lights, l, packet, lane, key)
+                    alone = block.rays[lane] == 1
+                    block.lamp_weight[lane] = add_light_ray(block, lane, lights, l, packet, lane, key, alone)
             lamp_visible(packet, world, mask, l, block.free)
             for lane in range(LANES):
                 if block.lamp_asked[lane] != 0 and k < block.rays[lane]:
@@ -352,12 +353,17 @@ def _shape(block: Block, lane: int, lights: LightTable, l: int) -> None:  # noqa
 
 @inlined
 def add_light_ray(
-    block: Block, i: int, lights: LightTable, l: int, packet: Packet, lane: int, key: Key  # noqa: E741
+    block: Block, i: int, lights: LightTable, l: int, packet: Packet, lane: int, key: Key, alone: bool  # noqa: E741
 ) -> float:
-    """Put a ray from hit `i` to a point of a light into a lane. Returns for how much it counts among others."""
+    """Put a ray from hit `i` to a point of a light into a lane. Returns for how much it counts among others; `alone`:
+    there are none."""
     u1, u2 = unit_pair(key, Purpose.LIGHT.value + l)
-    p = row(block.point, i)
-    direction, distance, weight = shadow_ray(lights, l, p, row(block.ns, i), u1, u2)
+    p, n = row(block.point, i), row(block.ns, i)
+    if alone:
+        pick, _ = unit_pair(key, Purpose.LIGHT_PICK.value)
+        direction, distance, weight = picked_shadow_ray(lights, l, p, n, u1, u2, pick)
+    else:
+        direction, distance, weight = shadow_ray(lights, l, p, n, u1, u2)
     if lights.reach[l, 0] < math.inf:
         distance = min(distance, _shadow_length(lights, l, key))
     add_shadow_ray(packet, lane, p, row(block.ng, i), direction, distance)

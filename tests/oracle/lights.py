@@ -80,6 +80,31 @@ def shadow_target(lamp: Lamp, p: Vec, u1: float, u2: float) -> tuple[Vec, float]
     return unit(to), length(to)
 
 
+def picked_target(lamp: Lamp, p: Vec, n: Vec, u1: float, u2: float, pick: float) -> tuple[Vec, float]:
+    """Of sixteen points of a light that is near, one, each as likely as what it brings is part of all."""
+    size = math.hypot(*lamp.size)
+    if lamp.kind is LightKind.DISTANT or lamp.size[0] <= 0.0 or length(sub(lamp.centre, p)) > 8.0 * size:
+        return shadow_target(lamp, p, u1, u2)
+    points = [shadow_target(lamp, p, (u1 + k / 16) % 1.0, (u2 + 7 * k / 16) % 1.0) for k in range(16)]
+    brings = [max(1e-30, _facing(lamp, p, d) * dot(d, n) / (distance * distance)) for d, distance in points]
+    # From the last to the first: each is it with its share of all up to it, of what `pick` has left.
+    chosen = 0
+    for k in range(16):
+        share = brings[k] / sum(brings[: k + 1])
+        if pick < share:
+            chosen, pick = k, pick / share
+        else:
+            pick = (pick - share) / (1.0 - share)
+    return points[chosen]
+
+
+def _facing(lamp: Lamp, p: Vec, d: Vec) -> float:
+    """Cosine at the light, or at what stands in its place: a disk or a rectangle that is turned to `p`."""
+    if lamp.kind is LightKind.SPHERE:
+        return dot(d, unit(sub(lamp.centre, p)))
+    return dot(d, _beside(lamp, p)[2]) if lamp.kind is LightKind.CYLINDER else -dot(d, lamp.face)
+
+
 def _beside(lamp: Lamp, p: Vec) -> tuple[float, float, Vec]:
     """Of a cylinder from `p`: distance to its middle along it, to its axis across, and the unit way across."""
     to = sub(lamp.centre, p)

@@ -12,7 +12,7 @@ import struct
 Key = tuple[int, int, int]
 """What a sequence hangs on: a pixel, and the branch, the way to the ray as digits to the base 4."""
 
-SKY_COSINE, MIRROR, ROUGH_LEAF, SKY_PICK, SKY_RADIANCE, SHADOW_LENGTH, FIRST_LIGHT = 1, 2, 3, 5, 6, 7, 16
+SKY_COSINE, MIRROR, ROUGH_LEAF, SKY_PICK, SKY_RADIANCE, SHADOW_LENGTH, LIGHT_PICK, FIRST_LIGHT = 1, 2, 3, 5, 6, 7, 8, 16
 
 _WORD = 0xFFFFFFFF
 

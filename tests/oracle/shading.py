@@ -151,7 +151,8 @@ class Shader:
             share = (1.0, 1.0, 1.0)
             if lamp.shadows:
                 u1, u2 = sampling.pair(key, sample, sampling.FIRST_LIGHT + k)
-                d, distance = lights.shadow_target(lamp, s.point, u1, u2)
+                pick = sampling.pair(key, sample, sampling.LIGHT_PICK)[0]
+                d, distance = lights.picked_target(lamp, s.point, s.ns, u1, u2, pick)
                 shadow = lamp.shadow
                 if shadow.distance < math.inf:
                     u = sampling.pair(key, sample, sampling.SHADOW_LENGTH)[0]
