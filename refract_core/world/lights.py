@@ -19,7 +19,7 @@ from typing import NamedTuple
 from ..kernels.arrays import F32_1D, F64_1D, F64_2D, F64_3D, I32_1D, I64_2D, U8_1D, U8_2D
 from ..kernels.choice import choice
 from ..kernels.compile import inlined, leaf
-from ..kernels.vec import Vec, add, cross, dot, frame, length, lerp, normalize, row, scale, sub, towards
+from ..kernels.vec import Vec, add, along, cross, dot, frame, length, lerp, normalize, row, scale, sub, towards
 from ..optics.lobes import ggx, sample_cosine, smith_visibility, specular_albedo
 from ..scene import LightKind
 from .glow import GlowTree, glow_highlight, glow_irradiance, glow_target
@@ -161,7 +161,7 @@ def picked_shadow_ray(
     to = sub(row(lights.axes[which], 3), p)
     kind = lights.kind[which]
     far = kind == LightKind.DISTANT.value or dot(to, to) > _FAR2 * (a * a + b * b)
-    if far or kind == LightKind.GLOW.value or kind == LightKind.BALL.value or a <= 0.0:
+    if far or kind == LightKind.GLOW.value or a <= 0.0:
         return shadow_ray(lights, which, p, n, u1, u2)
     direction, distance, weight, total = (0.0, 0.0, 0.0), 0.0, 0.0, 0.0
     for k in range(_POINTS):
@@ -295,12 +295,22 @@ def _distant_target(lamp: Lamp, p: Vec, n: Vec, u1: float, u2: float) -> tuple[V
 
 @inlined
 def _sphere_target(lamp: Lamp, p: Vec, n: Vec, u1: float, u2: float) -> tuple[Vec, float]:
-    """On the disk through its middle that it shows to `p`."""
+    """On the disk that it shows to `p`, which rays from there touch it around."""
     target = lamp.centre
     if lamp.a > 0.0:
-        x, y = frame(normalize(sub(p, lamp.centre)))
-        target = _on_disk(lamp.centre, x, y, lamp.a, u1, u2)
+        w, distance = towards(lamp.centre, p)
+        x, y = frame(w)
+        nearer, share = _touched(lamp.a, distance)
+        target = _on_disk(along(lamp.centre, w, nearer), x, y, lamp.a * share, u1, u2)
     return towards(p, target)
+
+
+@inlined
+def _touched(radius: float, distance: float) -> tuple[float, float]:
+    """Where rays from a place touch a ball or a tube: how much nearer than its middle that is [m], and the share of the
+    radius that is left there. Of a place inside, the middle and all of it."""
+    sine = radius / max(distance, 1e-12)
+    return (radius * sine, math.sqrt(1.0 - sine * sine)) if sine < 1.0 else (0.0, 1.0)
 
 
 @inlined
@@ -330,10 +340,12 @@ def across(lamp: Lamp, p: Vec) -> tuple[float, float, Vec]:
 
 @inlined
 def _cylinder_target(lamp: Lamp, p: Vec, n: Vec, u1: float, u2: float) -> tuple[Vec, float]:
-    """On the rectangle through its axis that it shows to `p`."""
-    _, _, w = across(lamp, p)
+    """On the rectangle that it shows to `p`, between the lines where rays from there touch it."""
+    _, rho, w = across(lamp, p)
     side = cross(lamp.x, w)
-    off = add(scale(lamp.x, (2.0 * u1 - 1.0) * lamp.b), scale(side, (2.0 * u2 - 1.0) * lamp.a))
+    nearer, share = _touched(lamp.a, rho)
+    off = add(scale(lamp.x, (2.0 * u1 - 1.0) * lamp.b), scale(side, (2.0 * u2 - 1.0) * lamp.a * share))
+    off = sub(off, scale(w, nearer))
     return towards(p, add(lamp.centre, off))
 
 
@@ -366,6 +378,20 @@ def _flat_facing(lamp: Lamp, p: Vec, d: Vec) -> float:
 def _sphere_facing(lamp: Lamp, p: Vec, d: Vec) -> float:
     """Of the disk that it shows."""
     return dot(d, normalize(sub(lamp.centre, p)))
+
+
+@inlined
+def _ball_facing(lamp: Lamp, p: Vec, d: Vec) -> float:
+    """The same, seen from as far as its face is, which is nearer than the disk."""
+    w, distance = towards(p, lamp.centre)
+    cosine = dot(d, w)
+    beyond = distance * distance - lamp.a * lamp.a
+    if beyond <= 0.0:
+        return cosine
+    ahead = distance * cosine
+    face = ahead - math.sqrt(max(0.0, ahead * ahead - beyond))
+    disk = beyond / max(distance * cosine, 1e-12)
+    return cosine * (face / disk) ** 2
 
 
 @inlined
@@ -660,7 +686,7 @@ KINDS = {
     LightKind.DISK: Kind(_disk_target, _flat_facing, _disk_irradiance, _disk_nearest),
     LightKind.CYLINDER: Kind(_cylinder_target, _cylinder_facing, _cylinder_irradiance, _cylinder_nearest, (1.0, 0.5)),
     LightKind.CAMERA: Kind(_camera_target, _all_facing, _camera_irradiance, _camera_nearest),
-    LightKind.BALL: Kind(_ball_target, _sphere_facing, _sphere_irradiance, _not_near),
+    LightKind.BALL: Kind(_ball_target, _ball_facing, _sphere_irradiance, _not_near),
 }
 _CAMERA = KINDS[LightKind.CAMERA]
 target_on = choice({kind: one.target for kind, one in KINDS.items()}, _CAMERA.target)

@@ -13,11 +13,12 @@ import math
 
 from ..kernels.arrays import F32_1D
 from ..kernels.compile import inlined
-from ..kernels.vec import Vec, along, dot, length, lerp, normalize, scale, sub
+from ..kernels.vec import Vec, along, cross, dot, frame, length, lerp, normalize, scale, sub
 from ..scene import LightKind
 from .lights import Lamp, LightTable, ShapeTable, across, lamp_of, nearest_to, target_on
 
-_RECT, _SPHERE, _CYLINDER = LightKind.RECT.value, LightKind.SPHERE.value, LightKind.CYLINDER.value
+_RECT, _DISK = LightKind.RECT.value, LightKind.DISK.value
+_SPHERE, _CYLINDER = LightKind.SPHERE.value, LightKind.CYLINDER.value
 _WHITE = (1.0, 1.0, 1.0)
 _BLACK = (0.0, 0.0, 0.0)
 
@@ -48,11 +49,12 @@ def shape_matt(lights: LightTable, which: int, p: Vec, n: Vec) -> Vec:
             level += 1
         firsts = seconds = 1 << level
     blur = _cell(kind, lamp, firsts, seconds) / distance
+    flat_kind, flat = _flat(kind, lamp, face)
     total, weights = _BLACK, 0.0
     for i in range(firsts):
         for j in range(seconds):
             u, v = (i + 0.5) / firsts, (j + 0.5) / seconds
-            d, away = target_on(kind, lamp, p, n, u, v)
+            d, away = target_on(flat_kind, flat, p, n, u, v)
             weight = max(0.0, dot(d, n)) * max(0.0, dot(d, face)) / (away * away)
             if weight <= 0.0:
                 continue
@@ -120,6 +122,17 @@ def _shown(kind: int, lamp: Lamp, p: Vec) -> tuple[Lamp, Vec]:
     else:
         return lamp, scale(lamp.face, -1.0)
     return Lamp(lamp.x, lamp.y, lamp.face, middle, half, lamp.b), face
+
+
+@inlined
+def _flat(kind: int, shown: Lamp, face: Vec) -> tuple[int, Lamp]:
+    """What `_shown` gives, as a disk or a rectangle."""
+    if kind == _SPHERE:
+        x, y = frame(scale(face, -1.0))
+        return _DISK, Lamp(x, y, shown.face, shown.centre, shown.a, 0.0)
+    if kind == _CYLINDER:
+        return _RECT, Lamp(shown.x, cross(shown.x, face), shown.face, shown.centre, shown.b, shown.a)
+    return kind, shown
 
 
 @inlined

@@ -71,10 +71,18 @@ def shadow_target(lamp: Lamp, p: Vec, u1: float, u2: float) -> tuple[Vec, float]
     if lamp.kind is LightKind.RECT:
         target = at(at(target, lamp.x, (2 * u1 - 1) * s), lamp.y, (2 * u2 - 1) * lamp.size[1])
     elif lamp.kind is LightKind.CYLINDER:  # the rectangle through its axis that faces the place
-        _, _, w = _beside(lamp, p)
-        target = at(at(target, lamp.x, (2 * u1 - 1) * lamp.size[1]), cross(lamp.x, w), (2 * u2 - 1) * s)
-    else:  # a disk as it is; of a sphere, the disk that it shows
-        x, y = basis(unit(sub(p, lamp.centre))) if lamp.kind is LightKind.SPHERE else (lamp.x, lamp.y)
+        _, rho, w = _beside(lamp, p)
+        sine = s / rho if s < rho else 0.0
+        half = s * math.sqrt(1.0 - sine * sine)
+        target = at(at(target, lamp.x, (2 * u1 - 1) * lamp.size[1]), cross(lamp.x, w), (2 * u2 - 1) * half)
+        target = at(target, w, -s * sine)
+    else:  # a disk as it is; of a sphere, the disk around which rays touch it
+        x, y = lamp.x, lamp.y
+        if lamp.kind is LightKind.SPHERE:
+            w, far = unit(sub(p, lamp.centre)), length(sub(p, lamp.centre))
+            x, y = basis(w)
+            sine = s / far if s < far else 0.0
+            target, s = at(target, w, s * sine), s * math.sqrt(1.0 - sine * sine)
         target = at(at(target, x, s * disk[0]), y, s * disk[1])
     to = sub(target, p)
     return unit(to), length(to)
