@@ -37,6 +37,9 @@ _LAYERS = 16
 _FLAT, _BENT = 0.99, 0.95
 """Length of the mean of unit normals below which a texel is large for what it lies on: that bends, or has an edge. And
 below which it turns."""
+_UNEVEN, _EVEN = 3.0, 4.0
+"""How many times as much as by chance the light of nine texels varies where it is not even; and how many times as many
+photons a texel has to have before its light is looked at closer where it is."""
 _FILTER = np.array([0.25, 0.5, 0.25])
 
 
@@ -172,6 +175,8 @@ def raise_levels(
     """Let photons of a level go on to the next, whose texels are a quarter as large, where these have `wanted` of them:
     as many of equal flux as would be as even (Kish, "Survey Sampling", 1965: the effective size of a sample). On
     what bends inside of a texel a quarter is enough, or a sixteenth: noise is better than light that has gone astray.
+    Where the light of a texel and of those around it varies by no more than what chance makes of so many photons, a
+    closer look would show that chance, so there have to be more of them.
 
     Args:
         tally: of `count_photons`; those of another kind are not counted.
@@ -190,6 +195,7 @@ def raise_levels(
         side = _side_of(n, axis) + 8 * landings.kind[k]
         column, line, layer = math.floor(u), math.floor(v), math.floor(w)
         light = squares = number = 0.0
+        total = total2 = by_chance = 0.0
         mean = (0.0, 0.0, 0.0)
         for i in range(-1, 2):
             for j in range(-1, 2):
@@ -199,9 +205,15 @@ def raise_levels(
                 squares += share * tally.squares[slot]
                 number += share * tally.number[slot]
                 mean = along(mean, row(tally.normal, slot), share)
+                total += tally.light[slot]
+                total2 += tally.light[slot] * tally.light[slot]
+                by_chance += tally.squares[slot]
         enough, one_way = 4.0 * wanted, length(mean)
         if one_way < _FLAT * number:
             enough = wanted if one_way >= _BENT * number else 0.25 * wanted
+        # The sum of a number of fluxes, itself by chance (Poisson), varies by the sum of their squares.
+        if total2 - total * total / 9.0 < _UNEVEN * 8.0 / 9.0 * by_chance:
+            enough *= _EVEN
         if light * light >= enough * squares:
             levels[k] = level + 1
             went += 1
