@@ -21,7 +21,7 @@ from urllib.parse import quote, urlencode, urlsplit
 
 from .signing import signed
 
-Kind = Literal["render", "convert", "inspect", "validate"]
+Kind = Literal["render", "convert", "bake-probes", "bake-thickness", "inspect", "validate"]
 Source = str | Path | Mapping[str, bytes | Path]
 """A stage: the name of one that the service has, a file to send, or several files by their names in the upload."""
 ENDED = ("done", "failed", "cancelled")
@@ -111,7 +111,28 @@ class Thumbnail(TypedDict, total=False):
     """Of an archive, the file to open."""
 
 
-Settings = RenderSettings | ConvertSettings
+class BakeProbesSettings(TypedDict, total=False):
+    """`only` names probes; `layout` is strip, cross or latlong."""
+
+    stage: str
+    webhook: str
+    only: list[str]
+    resolution: int
+    layout: str
+    samples: int
+
+
+class BakeThicknessSettings(TypedDict, total=False):
+    """`along` is normal or refracted; `texture` asks for pictures in place of primvars."""
+
+    stage: str
+    webhook: str
+    only: list[str]
+    along: str
+    texture: int
+
+
+Settings = RenderSettings | ConvertSettings | BakeProbesSettings | BakeThicknessSettings
 
 
 class Refused(Exception):
@@ -202,6 +223,14 @@ class Client:
     def convert(self, source: Source, settings: ConvertSettings | None = None) -> Result:
         """The stage as a .usdz with its glass described. Raises Refused."""
         return self._result(*self._work("convert", source, settings, {"Accept": "model/vnd.usdz+zip"}))
+
+    def bake_probes(self, source: Source, settings: BakeProbesSettings | None = None) -> Result:
+        """The stage as a .usdz with its reflection probes baked. Raises Refused."""
+        return self._result(*self._work("bake-probes", source, settings, {"Accept": "model/vnd.usdz+zip"}))
+
+    def bake_thickness(self, source: Source, settings: BakeThicknessSettings | None = None) -> Result:
+        """The stage as a .usdz with the thickness of its glass measured. Raises Refused."""
+        return self._result(*self._work("bake-thickness", source, settings, {"Accept": "model/vnd.usdz+zip"}))
 
     def inspect(self, source: Source, *, stage: str = "") -> dict[str, Any]:
         """What is in a stage. Raises Refused."""

@@ -149,6 +149,27 @@ class Convert(StageOnly):
     flatten: bool | None = None
 
 
+class BakeProbes(StageOnly):
+    """`POST /v1/bake-probes`. Answers with a .usdz, or, where JSON is accepted, with what was done."""
+
+    only: Annotated[list[Path], Field(max_length=256)] | None = None
+    resolution: Annotated[int, Field(ge=8, le=4096, description=(
+        "texels on a side of each face; left out, each probe's own"
+    ))] | None = None  # fmt: skip
+    layout: Literal["strip", "cross", "latlong"] | None = None
+    samples: Annotated[int, Field(ge=1, le=4096, description="rays per texel; left out, 16")] | None = None
+
+
+class BakeThickness(StageOnly):
+    """`POST /v1/bake-thickness`. Answers with a .usdz, or, where JSON is accepted, with what was done."""
+
+    only: Annotated[list[Path], Field(max_length=256)] | None = None
+    along: Literal["normal", "refracted"] | None = None
+    texture: Annotated[int, Field(ge=16, le=8192, description=(
+        "texels on a side of a picture in each object's own uv; left out, primvars"
+    ))] | None = None  # fmt: skip
+
+
 class Warning_(BaseModel):
     model_config = ConfigDict(title="Warning")
     path: str
@@ -202,7 +223,7 @@ class Job(BaseModel):
     """What `GET /v1/jobs/{id}` answers."""
 
     id: str
-    kind: Literal["render", "convert", "inspect", "validate"]
+    kind: Literal["render", "convert", "bake-probes", "bake-thickness", "inspect", "validate"]
     status: Literal["queued", "running", "done", "failed", "cancelled"]
     fraction: float
     stage_of_work: str
@@ -246,4 +267,7 @@ class LimitTable(BaseModel):
     confinement: dict[str, Any] = Field(description="what confines workers on this machine")
 
 
-KINDS: dict[str, type[StageOnly]] = {"render": Render, "convert": Convert, "inspect": StageOnly, "validate": StageOnly}
+KINDS: dict[str, type[StageOnly]] = {
+    "render": Render, "convert": Convert, "bake-probes": BakeProbes, "bake-thickness": BakeThickness,
+    "inspect": StageOnly, "validate": StageOnly,
+}  # fmt: skip

@@ -41,7 +41,7 @@ _RESULT_HEADERS = {
     "Vary": _header("Accept, which chooses the format"),
 }
 _TAGS = (
-    ("work", ("/v1/render", "/v1/convert", "/v1/inspect", "/v1/validate"), "what is done with a stage"),
+    ("work", ("/v1/render", "/v1/convert", "/v1/bake", "/v1/inspect", "/v1/validate"), "what is done with a stage"),
     ("jobs", ("/v1/jobs",), "how a job is doing, and what it made"),
     ("thumbnails", ("/v1/thumbnails", "/v1/pictures/", "/v1/stages/"),
      "pictures with an address, and the stages sent for them"),
@@ -54,6 +54,8 @@ _EXAMPLES: dict[str, dict[str, Any]] = {
     "small and quick": {"stage": "marble.usda", "image_width": 320, "samples": 1},
     "sizes for a shop": {"stage": "marble.usda", "widths": [64, 256, 1024], "format": "webp"},
     "another glass": {"stage": "marble.usda", "overrides": {"/World/Looks/Amber": {"ior": 1.33}}},
+    "small probes": {"stage": "marble.usda", "resolution": 64, "layout": "latlong"},
+    "as light goes": {"stage": "marble.usda", "along": "refracted"},
     "for glTF": {"stage": "preview_surface.usda", "to": "gltf", "thickness": "measured"},
 }
 """Bodies, each for the requests that have these fields."""

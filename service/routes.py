@@ -27,7 +27,7 @@ from .limits import table
 from .openapi import problems
 from .problems import Problem, document_response
 from .shares import Client
-from .store import RESULTS, Record, count_of
+from .store import RESULTS, STAGES_MADE, Record, count_of
 from .webhooks import Webhooks
 
 router = APIRouter(prefix="/v1")
@@ -40,6 +40,8 @@ _TYPES = {
 Ask = Callable[[dict[str, Any], str], str]
 """Completes the settings of a job by the header Accept, and returns the media type of the answer."""
 _OBJECT: dict[str, Any] = {"type": "object"}
+_PACKAGE = _TYPES[".usdz"]
+_BAKED = {"type": "object", "required": ["stage", "out", "summary", "prims", "notices"]}
 _CONVERTED = {"type": "object", "required": ["stage", "out", "materials", "notices"]}
 
 
@@ -81,11 +83,31 @@ def _ask_for_pictures(settings: dict[str, Any], accept: str) -> str:
 
 @router.post("/convert", response_class=Response, **openapi.work(
     models.Convert, "the converted stage, or what was done",
-    {"model/vnd.usdz+zip": {}, "application/json": {"schema": _CONVERTED}},
+    {_PACKAGE: {}, "application/json": {"schema": _CONVERTED}},
 ))  # fmt: skip
 async def convert(request: Request) -> Response:
     """Find the glass of a stage and describe it with RefractMaterialAPI, as `refract convert`."""
-    return await _work(request, "convert", _given(request, "model/vnd.usdz+zip", "application/json"))
+    return await _work(request, "convert", _given(request, _PACKAGE, "application/json"))
+
+
+@router.post("/bake-probes", response_class=Response, **openapi.work(
+    models.BakeProbes, "the stage with its probes baked, or what was done",
+    {_PACKAGE: {}, "application/json": {"schema": _BAKED}},
+))  # fmt: skip
+async def bake_probes(request: Request) -> Response:
+    """Bake the reflection probes of a stage, as `refract bake probes`. The package holds the layer that uses them, the
+    stage below it, and the cubemaps as EXR."""
+    return await _work(request, "bake-probes", _given(request, _PACKAGE, "application/json"))
+
+
+@router.post("/bake-thickness", response_class=Response, **openapi.work(
+    models.BakeThickness, "the stage with the thickness of its glass, or what was done",
+    {_PACKAGE: {}, "application/json": {"schema": _BAKED}},
+))  # fmt: skip
+async def bake_thickness(request: Request) -> Response:
+    """Measure how thick the glass of a stage is, as `refract bake thickness`. The package holds the layer that says so,
+    the stage below it, and with `texture` the pictures."""
+    return await _work(request, "bake-thickness", _given(request, _PACKAGE, "application/json"))
 
 
 @router.post("/inspect", response_class=Response, **openapi.work(
@@ -172,6 +194,10 @@ def check_limits(settings: dict[str, Any], jobs: Jobs) -> None:
     height, samples = (settings.get(name) or 1 for name in ("image_height", "samples"))
     wide = max(settings.get("widths", (settings.get("image_width") or 1,)))
     count, width = count_of(settings), "/widths" if "widths" in settings else "/image_width"
+    if edge := settings.get("resolution"):  # six faces in a row
+        wide, height, width = 6 * edge, edge, "/resolution"
+    if edge := settings.get("texture"):
+        wide, height, width = edge, edge, "/texture"
     asked = {
         "pictures": (count, "/time_codes" if "time_codes" in settings else "/widths"),
         "pixels": (wide * height, width), "samples": (samples, "/samples"),
@@ -330,15 +356,16 @@ async def aov(request: Request, identifier: str, name: str) -> Response:
     return result(request, jobs_of(request), _known(request, identifier), f"aov.{name}.png")
 
 
-@router.get("/jobs/{identifier}/file", response_class=Response, **openapi.result("the stage", "model/vnd.usdz+zip"))
-async def converted(request: Request, identifier: str) -> Response:
-    """The stage that a conversion made."""
-    return result(request, jobs_of(request), _known(request, identifier), "converted.usdz")
+@router.get("/jobs/{identifier}/file", response_class=Response, **openapi.result("the stage", _PACKAGE))
+async def made_stage(request: Request, identifier: str) -> Response:
+    """The stage that a conversion or a bake made."""
+    record = _known(request, identifier)
+    return result(request, jobs_of(request), record, STAGES_MADE.get(record.kind, ""))
 
 
 @router.get("/jobs/{identifier}/report", response_class=Response, **openapi.result("the report", "application/json"))
 async def report(request: Request, identifier: str) -> Response:
-    """What a conversion, inspection or validation found."""
+    """What a conversion, bake, inspection or validation found."""
     return result(request, jobs_of(request), _known(request, identifier), "report.json")
 
 

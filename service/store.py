@@ -23,8 +23,10 @@ from .problems import Problem
 ENDED = ("done", "failed", "cancelled")
 RESULTS = re.compile(
     r"^((image|picture\.\d{1,4})\.(png|jpg|webp|avif|exr)|pictures\.zip|aov\.[A-Za-z_.]+\.png|report\.json|"
-    r"converted\.usdz)$"
+    r"(converted|baked)\.usdz)$"
 )
+STAGES_MADE = {"convert": "converted.usdz", "bake-probes": "baked.usdz", "bake-thickness": "baked.usdz"}
+"""What verbs that make a stage call it, beside their report."""
 _ID = re.compile(r"^[0-9a-f]{64}$")
 _FORGOTTEN = 3600.0  # [s]
 _FILES_OF_JOB, _BYTES_OF_JOB = 32, 1 << 20
@@ -73,15 +75,15 @@ class Record:
         """The file that the job is done for, or its report where it makes one, too."""
         if self.kind == "render":
             return "pictures.zip" if count_of(self.settings) > 1 else f"image.{self.settings['format']}"
-        return "converted.usdz" if self.kind == "convert" and not report else "report.json"
+        return "report.json" if report else STAGES_MADE.get(self.kind, "report.json")
 
     def document(self) -> dict[str, Any]:
         """As `models.Job`."""
         here = f"/v1/jobs/{self.id}"
         links = {"self": here, "events": f"{here}/events"}
         if self.status == "done":
-            links |= {"render": {"image": f"{here}/image"}, "convert": {"file": f"{here}/file",
-                      "report": f"{here}/report"}}.get(self.kind, {"report": f"{here}/report"})  # fmt: skip
+            links |= {"image": f"{here}/image"} if self.kind == "render" else {"report": f"{here}/report"}
+            links |= {"file": f"{here}/file"} if self.kind in STAGES_MADE else {}
         aovs = [{**aov, "href": f"{here}/aovs/{aov['name']}.png"} for aov in self.result.get("aovs", [])]
         several = self.result.get("pictures", [])
         pictures = [{**one, "href": f"{here}/pictures/{number}"} for number, one in enumerate(several)]

@@ -10,7 +10,7 @@ import json
 import os
 import re
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -19,7 +19,8 @@ import numpy as np
 from refract_core.errors import EmbreeError, ImageError, RefractError, SceneError, StageError, UsageError
 from refract_core.images.aovs import AOVS
 from refract_core.images.frame import Frame
-from refract_core.scene import Notice, Scene
+from refract_core.progress import Report
+from refract_core.scene import Cubemap, Notice, Probe, Scene
 from refract_core.settings import NO_ORBIT, RenderSettings
 from refract_core.verbs.override import OverrideError, Overrides, override, override_notes
 
@@ -232,8 +233,7 @@ def _sized(settings: RenderSettings, size: tuple[int, int]) -> RenderSettings:
 
 def asked_of(settings: Mapping[str, Any]) -> dict[str, Any]:
     """What settings ask of `RenderSettings`."""
-    asked = {name: settings[name] for name in _SETTINGS if settings.get(name) is not None}
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in asked.items()}
+    return _asked(settings, *_SETTINGS)
 
 
 def _share_of(say: Say, before: int, count: int) -> Callable[[float, str], None]:
@@ -369,6 +369,67 @@ def _convert(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[
     return {}
 
 
+def _bake_probes(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[str, int], say: Say) -> Any:
+    from refract_core.rendering.ready import capture_probes
+    from refract_core.verbs.bake_probes import BakeOrder, bake_probes
+
+    made = os.path.join(out, "baked.usdz")
+    order = BakeOrder(stage=stage, out=made, jobs=settings["threads"], **_asked(settings, "only", "resolution",
+                      "layout", "samples"))  # fmt: skip
+    rays = 0
+
+    def capture(scene: Scene, probes: Sequence[Probe], **how: Any) -> list[Cubemap]:
+        """As many probes as are captured together, where the limits allow them and all before them."""
+        nonlocal rays
+        check_scene(scene, limits)
+        for probe in probes:
+            _check_size(6 * probe.resolution, probe.resolution, order.samples, limits)
+            rays += 6 * probe.resolution**2 * order.samples
+        if rays > limits["pixel_samples"]:
+            text = f"probes up to {probes[-1].path}, with {order.samples} samples: pixel_samples would be {rays}"
+            raise Problem("limit-exceeded", f"{text}; the limit is {limits['pixel_samples']}")
+        return capture_probes(scene, list(probes), **how)
+
+    return _baked(stage, made, lambda report: bake_probes(order, report, lambda: False, capture=capture), limits, say)
+
+
+def _bake_thickness(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[str, int], say: Say) -> Any:
+    from refract_core.verbs.bake_thickness import ThicknessOrder, bake_thickness
+
+    made = os.path.join(out, "baked.usdz")
+    order = ThicknessOrder(stage=stage, out=made, jobs=settings["threads"], **_asked(settings, "only", "along",
+                           "texture"))  # fmt: skip
+    return _baked(stage, made, lambda report: bake_thickness(order, report, lambda: False), limits, say)
+
+
+def _asked(settings: Mapping[str, Any], *names: str) -> dict[str, Any]:
+    """The settings that were given; what is left out is as on the command line."""
+    asked = {name: settings[name] for name in names if settings.get(name) is not None}
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in asked.items()}
+
+
+def _baked(
+    stage: str, made: str, bake: Callable[[Report], Any], limits: Mapping[str, int], say: Say
+) -> dict[str, Any]:  # fmt: skip
+    """Bake, and write what was told of it as the report."""
+    notices: list[Notice] = []
+    done: list[dict[str, str]] = []
+
+    def progress(share: float, work: str) -> None:
+        if share > 0.0:
+            reading.has_ended()
+        say(progress=share, stage=work)
+
+    bake(Report(progress, lambda path, text: notices.append(Notice(path, text)),
+                lambda path, text: done.append({"path": path, "text": text}), lambda _text: None))  # fmt: skip
+    _tell(notices, say, limits)
+    _write(os.path.dirname(made), _clean({
+        "stage": stage, "out": os.path.basename(made), "summary": done[-1]["text"], "prims": done[:-1],
+        "notices": [asdict(notice) for notice in notices],
+    }))  # fmt: skip
+    return {}
+
+
 def _clean(value: Any) -> Any:
     """Every text in a report, for strangers; numbers that JSON does not have are null."""
     if isinstance(value, str):
@@ -385,5 +446,8 @@ def _write(out: str, report: Any) -> None:
         json.dump(report, file, allow_nan=False, indent=2)
 
 
-_VERBS = {"render": _render, "inspect": _inspect, "validate": _validate, "convert": _convert}
+_VERBS = {
+    "render": _render, "inspect": _inspect, "validate": _validate, "convert": _convert, "bake-probes": _bake_probes,
+    "bake-thickness": _bake_thickness,
+}  # fmt: skip
 assert set(_UNITS) <= AOVS.keys()

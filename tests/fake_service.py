@@ -40,6 +40,9 @@ VERDICT = {"format": "refract.validate/1", "errors": 1, "warnings": 1, "infos": 
 BALL = {"path": "/World/Looks/Ball", "action": "applied", "model": "sphere", "ior": 1.5, "why": "a ball", "notes": []}
 CONVERTED = {"stage": "x.usda", "out": "converted.usdz", "materials": [BALL],
              "notices": [{"path": "/World", "text": "left alone"}]}  # fmt: skip
+BAKED = {"stage": "x.usda", "out": "baked.usdz", "summary": "1 prims measured along normal, 1 left alone",
+         "prims": [{"path": "/World/Ball", "text": "2 to 2, mean 2; constant"}],
+         "notices": [{"path": "/World/Block", "text": "is open"}]}  # fmt: skip
 TOOK = 1.9
 """[s] What every job says it took, whatever it did."""
 
@@ -99,7 +102,7 @@ class Job:
                    "prim": "/World/Ball"}  # fmt: skip
         told = status == "done" and self.settings.get("samples") == 2
         warnings = [{"path": "/World/Block", "text": "drawn unrefined"}] if told else []
-        whites = {"thickness": 1.24}
+        whites = {"thickness": 1.24, "Z": 8.0}
         aovs = [{"name": name, "href": "", "white": whites.get(name, 1.0)} for name in self.settings["aovs"]]
         return {
             "id": self.id, "kind": "render", "status": status, "fraction": fraction, "stage_of_work": "tiles",
@@ -181,8 +184,9 @@ class Handler(BaseHTTPRequestHandler):
             if colour is None:
                 return self.problem(404, "not-found", "There is nothing here", "")
             return self.reply(200, png(lambda x, y: colour), "image/png")
-        if path == "/v1/jobs/checked/file":
-            return self.reply(200, b"a converted stage", "model/vnd.usdz+zip")
+        if path in ("/v1/jobs/checked/file", "/v1/jobs/baked/file"):
+            what = b"a converted stage" if "checked" in path else b"a baked stage"
+            return self.reply(200, what, "model/vnd.usdz+zip")
         return self.job(*path.removeprefix("/v1/jobs/").split("/"))
 
     def live(self, settings: dict[str, Any]) -> None:
@@ -216,6 +220,8 @@ class Handler(BaseHTTPRequestHandler):
         if self.path in ("/v1/validate", "/v1/convert"):
             made = {"Content-Location": "/v1/jobs/checked"}
             return self.document(200, VERDICT if self.path == "/v1/validate" else CONVERTED, made)
+        if self.path.startswith("/v1/bake-"):
+            return self.document(200, BAKED, {"Content-Location": "/v1/jobs/baked"})
         if settings.get("samples", 0) > 1000:
             where = [{"pointer": "/samples", "detail": "must be at most 1000"}]
             return self.problem(422, "invalid-settings", "The settings are not valid", "One field is wrong.", where)

@@ -174,6 +174,19 @@ def test_skip_existing_leaves_files_and_may_leave_nothing_to_do(engine: Engine, 
     assert (tmp_path / "a.1.png").read_text() == "mine"
 
 
+def test_how_many_pictures_are_skipped_is_told_once(engine: Engine, tmp_path: Path) -> None:
+    (tmp_path / "a.2.png").write_text("mine")
+    ended = refract("render", "a.usda", tmp_path / "a.#.png", "-f", "1:3", "--skip-existing")
+    assert ended.code == 0
+    assert [line for line in ended.err.splitlines() if "pictures exist" in line] == ["1 of 3 pictures exist, skipped"]
+
+
+def test_a_picture_on_stdout_is_never_there_before(engine: Engine) -> None:
+    ended = refract("render", "a.usda", "-", "--skip-existing")
+    assert (ended.code, engine.stages) == (2, [])
+    assert "--skip-existing" in ended.err
+
+
 def test_color_correction_and_aovs_reach_the_file(engine: Engine, tmp_path: Path) -> None:
     path = tmp_path / "a.png"
     for mode, byte in (("sRGB", 255), ("disabled", 255)):

@@ -334,6 +334,20 @@ def test_the_pixel_under_the_pointer_is_read_with_its_unit(page: Any) -> None:
     playwright.expect(read).to_contain_text("Point at the picture")
 
 
+def test_every_plane_is_read_at_the_pixel(page: Any) -> None:
+    pick(page)
+    page.get_by_text("Every plane at this pixel").click()
+    page.mouse.move(*over(page, 32, 18))
+    read = page.locator("#planes")
+    for line in ("thickness 0.311 m", "depth 2.01 m", "coverage by glass 1", "normal -0.498, -0.498, -0.498"):
+        playwright.expect(read.get_by_role("row", name=line)).to_be_visible()  # 64 of 255 of what white is
+    page.mouse.move(*over(page, 2, 3))
+    playwright.expect(read.get_by_role("row", name="thickness no glass")).to_be_visible()
+    playwright.expect(read.get_by_role("row", name="Pixel 2, 3")).to_be_visible()
+    page.mouse.move(1, 1)
+    playwright.expect(read.get_by_role("row", name="Pixel 2, 3")).to_be_visible()  # what was read last stays
+
+
 def test_a_pixel_is_read_by_touch_and_marked(browser: Any, service: FakeService) -> None:
     context = browser.new_context(viewport={"width": 390, "height": 800}, has_touch=True)
     context.set_default_timeout(PATIENCE)
@@ -412,6 +426,39 @@ def test_a_converted_stage_can_be_taken_away(page: Any, service: FakeService, tm
     page.get_by_role("button", name="Another stage").click()
     choose(page, "room.usda")
     playwright.expect(page.locator("#checked")).to_be_hidden()
+
+
+@pytest.mark.parametrize(("verb", "button", "option", "value", "asked"), [
+    ("convert", "Convert", "Also described for", "gltf", {"to": "gltf"}),
+    ("bake-thickness", "Bake thickness", "Kept in", "512", {"texture": 512}),
+    ("bake-probes", "Bake probes", "Texels of a face", "64", {"resolution": 64}),
+])  # fmt: skip
+def test_how_a_stage_is_made_can_be_chosen(
+    page: Any, service: FakeService, verb: str, button: str, option: str, value: str, asked: dict[str, Any]
+) -> None:
+    """By itself as the command line does it; a choice asks again, and leaving it asks for nothing once more."""
+    pick(page)
+    page.get_by_role("button", name=button).click()
+    playwright.expect(page.get_by_role("button", name="Download .usdz")).to_be_visible()
+    page.get_by_label(option).select_option(value)
+    until(page, lambda: len(service.asked("POST", f"/v1/{verb}")) == 2)
+    page.get_by_label(option).select_option("")
+    until(page, lambda: len(service.asked("POST", f"/v1/{verb}")) == 3)
+    told = [{name: body[name] for name in body if name != "stage"} for body in service.asked("POST", f"/v1/{verb}")]
+    assert told == [{}, asked, {}]
+
+
+def test_a_baked_stage_can_be_taken_away(page: Any, tmp_path: Path) -> None:
+    pick(page)
+    page.get_by_role("button", name="Bake thickness").click()
+    playwright.expect(page.locator("#checked-title")).to_have_text("1 prims measured along normal, 1 left alone")
+    playwright.expect(page.locator("#checked-found")).to_contain_text("2 to 2, mean 2")
+    playwright.expect(page.locator("#checked-found")).to_contain_text("is open")
+    with page.expect_download() as taken:
+        page.get_by_role("button", name="Download .usdz").click()
+    assert taken.value.suggested_filename == "ball.thickness.usdz"
+    taken.value.save_as(tmp_path / "made.usdz")
+    assert (tmp_path / "made.usdz").read_bytes() == b"a baked stage"
 
 
 def test_tier_order_by_keyboard(page: Any, service: FakeService) -> None:

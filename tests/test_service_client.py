@@ -36,6 +36,8 @@ def ours(server: Server) -> Client:
 def test_the_client_knows_every_setting_and_no_other() -> None:
     assert client.RenderSettings.__annotations__.keys() == models.Render.model_fields.keys()
     assert client.ConvertSettings.__annotations__.keys() == models.Convert.model_fields.keys()
+    assert client.BakeProbesSettings.__annotations__.keys() == models.BakeProbes.model_fields.keys()
+    assert client.BakeThicknessSettings.__annotations__.keys() == models.BakeThickness.model_fields.keys()
     assert client.OverrideValues.__annotations__.keys() == models.Override.model_fields.keys()
     assert Job.__dataclass_fields__.keys() <= models.Job.model_fields.keys()
 
@@ -66,6 +68,9 @@ def test_stages_are_drawn_by_name_by_file_and_by_files(ours: Client, tmp_path: P
     assert ours.inspect(files, stage="a/shot.usda")["stage"] == "a/shot.usda"
     assert ours.validate("window.usda")["findings"] is not None
     assert zipfile.ZipFile(io.BytesIO(ours.convert("preview_surface.usda").content)).namelist()
+    assert zipfile.ZipFile(io.BytesIO(ours.bake_thickness(tmp_path / "ball.usda").content)).namelist()
+    probes = ours.bake_probes("two_probes.usda", {"resolution": 8, "samples": 1}).content
+    assert any(name.endswith(".exr") for name in zipfile.ZipFile(io.BytesIO(probes)).namelist())
     assert ours.limits()["samples"] == 64
 
 

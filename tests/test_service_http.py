@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from pxr import Usd
+from pxr import Usd, UsdGeom
 from service_server import BALL, LONG, PATIENT, ROOT, SMALL, Server, kill, running, until, upload
 
 from refract_core.images.pictures import read_texture
@@ -143,6 +144,61 @@ def test_convert_gives_a_package_without_paths_of_ours(client: httpx.Client, tmp
     assert str(tmp_path.parents[0]) not in text.replace(str(tmp_path), "")
     report = client.post("/v1/convert", json=body, headers={"Accept": "application/json"}).json()
     assert report["materials"]
+
+
+def opened(content: bytes, file: Path) -> Usd.Stage:
+    """A package that opens by itself, and names no folder of the machine that made it."""
+    file.write_bytes(content)
+    stage = Usd.Stage.Open(str(file))
+    text = "".join(layer.ExportToString() for layer in stage.GetUsedLayers(includeClipLayers=False))
+    assert str(ROOT) not in text.replace(str(file.parent), "")
+    assert "/out/" not in text
+    return stage
+
+
+def test_baked_probes_come_with_their_stage_and_their_cubemaps(client: httpx.Client, tmp_path: Path) -> None:
+    body = {"stage": "two_probes.usda", "resolution": 8, "samples": 1}
+    answer = client.post("/v1/bake-probes", json=body)
+    assert answer.headers["content-type"] == "model/vnd.usdz+zip", answer.text
+    stage = opened(answer.content, tmp_path / "baked.usdz")
+    report = client.post("/v1/bake-probes", json=body, headers={"Accept": "application/json"}).json()
+    assert report["prims"]
+    inside = set(zipfile.ZipFile(tmp_path / "baked.usdz").namelist())
+    for one in report["prims"]:
+        texture = stage.GetPrimAtPath(one["path"]).GetAttribute("probe:texture").Get()
+        assert texture.path.removeprefix("./") in inside
+        assert texture.resolvedPath
+
+
+def test_baked_thickness_is_that_of_the_geometry(client: httpx.Client, tmp_path: Path) -> None:
+    answer = post(client, "bake-thickness")
+    assert answer.headers["content-type"] == "model/vnd.usdz+zip", answer.text
+    stage = opened(answer.content, tmp_path / "baked.usdz")
+    thickness = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/World/Ball")).GetPrimvar("refraction:thickness").Get()
+    assert np.allclose(thickness, 2.0, rtol=0.01)  # straight in, through the middle of a ball of radius 1
+    where = answer.headers["content-location"]
+    report = client.get(f"{where}/report").json()
+    assert [one["path"] for one in report["prims"]] == ["/World/Ball"]
+    assert client.get(f"{where}/file").content == answer.content
+
+
+@pytest.mark.parametrize(("verb", "settings", "pointer"), [
+    ("bake-probes", {"resolution": 4096}, "/resolution"), ("bake-probes", {"samples": 4096}, "/samples"),
+    ("bake-probes", {"resolution": 4}, "/resolution"), ("bake-thickness", {"texture": 8192}, "/texture"),
+    ("bake-thickness", {"along": "sideways"}, "/along"), ("bake-thickness", {"samples": 1}, "/samples"),
+])  # fmt: skip
+def test_a_bake_beyond_the_limits_is_refused_at_once(
+    client: httpx.Client, verb: str, settings: dict[str, Any], pointer: str
+) -> None:
+    answer = post(client, verb, **settings)
+    assert answer.status_code == 422
+    assert [one["pointer"] for one in answer.json()["errors"]] == [pointer]
+
+
+def test_probes_of_a_stage_count_together(client: httpx.Client) -> None:
+    """Each of them is within the limits, which are looked at again when the stage has been read."""
+    answer = client.post("/v1/bake-probes", json={"stage": "two_probes.usda", "resolution": 600, "samples": 64})
+    assert (answer.status_code, answer.json()["type"]) == (422, "/problems/limit-exceeded"), answer.text
 
 
 def test_cancel_kills_the_process(client: httpx.Client, server: Server) -> None:

@@ -20,7 +20,7 @@ from schemathesis.engine import events, from_schema  # noqa: E402
 
 pytestmark = pytest.mark.slow
 GOOD = ROOT / "usd_samples" / "good"
-WORK = ("render", "convert", "inspect", "validate")
+WORK = ("render", "convert", "bake-probes", "bake-thickness", "inspect", "validate")
 TOKEN = "a-token-of-the-tests"
 AUTHORIZED = {"Authorization": f"Bearer {TOKEN}"}
 EXAMPLES = 25

@@ -305,8 +305,8 @@ def test_pages_load_nothing_from_elsewhere(client: InProcess) -> None:
 
 def test_the_openapi_document_names_every_route(client: InProcess) -> None:
     paths = client.get("/openapi.json").json()["paths"]
-    for path in ("/v1/render", "/v1/convert", "/v1/inspect", "/v1/validate", "/v1/jobs/{identifier}", "/v1/stages",
-                 "/v1/limits", "/livez", "/readyz", "/metrics"):  # fmt: skip
+    for path in ("/v1/render", "/v1/convert", "/v1/bake-probes", "/v1/bake-thickness", "/v1/inspect", "/v1/validate",
+                 "/v1/jobs/{identifier}", "/v1/stages", "/v1/limits", "/livez", "/readyz", "/metrics"):  # fmt: skip
         assert path in paths
     form = paths["/v1/render"]["post"]["requestBody"]["content"]
     assert form["application/json"]["schema"]["additionalProperties"] is False
@@ -335,7 +335,7 @@ def test_the_openapi_document_tells_where_a_token_is_asked_for(tmp_path: Path, t
 
 def test_the_openapi_document_tells_what_is_refused(client: InProcess) -> None:
     document = client.get("/openapi.json").json()
-    for verb in ("render", "convert", "inspect", "validate"):
+    for verb in ("render", "convert", "bake-probes", "bake-thickness", "inspect", "validate"):
         body = document["paths"][f"/v1/{verb}"]["post"]["requestBody"]["content"]
         named = body["application/json"]["schema"]
         assert named["required"] == ["stage"]

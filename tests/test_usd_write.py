@@ -120,6 +120,16 @@ def test_a_layer_inside_a_package_can_be_the_stage(package: Path) -> None:
         assert content(stage.GetPrimAtPath("/Part").GetAttribute("picture").Get()) == b"parts/tex/a.png"
 
 
+def test_a_package_knows_a_stage_of_another_tree_and_tells_no_folder_of_it(tmp_path: Path) -> None:
+    stage, out = Path(__file__).parents[1] / "usd_samples" / "good" / "marble.usda", tmp_path / "a.usdz"
+    save(overlay(str(stage), made="test"), str(out))
+    record = Sdf.Layer.FindOrOpen(str(out)).customLayerData[RECORD]
+    assert str(stage.parent) not in record["stage"]
+    check_out(str(stage), str(out), overwrite=False, ours="test")
+    with pytest.raises(UsageError, match="exists already"):
+        check_out(str(stage.with_name("window.usda")), str(out), overwrite=False, ours="test")
+
+
 def test_formats_follow_the_extension(stage: Path) -> None:
     starts = {}
     for extension in EXTENSIONS:

@@ -16,7 +16,7 @@ from ..verbs.render_files import Order, render_files
 from .app import Jobs, Mask, ProgressMode, Quiet, SessionLayer, Variant, Verbose, app, opening_of, outcome, words
 from .looks import shown_on_signal
 from .orbit import Azimuth, Distance, Elevation, Fit, FocalLength, Fov, LookAt, orbit_of
-from .stdout import written_to
+from .stdout import STDOUT, written_to
 
 Stage = Annotated[
     str,
@@ -400,6 +400,8 @@ def render(
         crew_at(executor) as crew,
         shown_on_signal() as asked,
     ):
+        if skip_existing and out == STDOUT:
+            raise UsageError("--skip-existing: a picture on stdout (OUT -) is never there before; name a file")
         given = {
             **orbit_of(azimuth, elevation, distance, fit, fov, focal_length, look_at),
             "image_width": image_width,

@@ -176,6 +176,8 @@ def _left(order: Order, jobs: Sequence[FrameJob], report: Report) -> list[FrameJ
     skipped = [job for job in jobs if order.skip_existing and _exists(job.path, order.aovs)]
     for job in skipped:
         report.done(job.path, "exists, skipped")
+    if skipped and len(jobs) > 1:
+        report.closing(f"{len(skipped)} of {len(jobs)} pictures exist, skipped")
     return [job for job in jobs if job not in skipped]
 
 

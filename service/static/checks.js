@@ -1,15 +1,34 @@
-// What the service says of the file itself: what is in it, what is wrong with it, and its glass as the renderer's own material.
+// What the service says of the file itself: what is in it, what is wrong with it, and the stages it makes of it: its glass as the
+// renderer's own material, and what is worked out once and kept.
 
 import { bodyOf, send } from "./api.js";
-import { pictureName } from "./commands.js";
+import { fileName } from "./commands.js";
 import { $, counted, download, make } from "./dom.js";
 import { report } from "./problems.js";
 import { state } from "./state.js";
+import { MODELS } from "./words.js";
 
 const MOST = 200; // findings shown; the file has them all
 const ORDER = ["error", "warning", "info"];
-const KINDS = ["inspect", "validate", "convert"];
-const DOING = { inspect: "Inspecting", validate: "Validating", convert: "Converting" };
+const DOING = {
+  inspect: "Inspecting", validate: "Validating", convert: "Converting", "bake-thickness": "Measuring the glass of", "bake-probes": "Baking the probes of",
+};
+const KINDS = Object.keys(DOING);
+const MADE = { convert: "converted.usdz", "bake-thickness": "thickness.usdz", "bake-probes": "probes.usdz" }; // verbs that make a stage
+// What may be asked of them: the setting, what it is called, what it is when nothing is chosen, and what else it may be.
+const texels = (...counts) => counts.map((count) => [count, `${count} x ${count}`]);
+const OPTIONS = {
+  convert: [
+    ["model", "Model", "as found", MODELS.map((model) => [model, model])],
+    ["thickness", "Thickness", "as typed", [["measured", "measured"]]],
+    ["to", "Also described for", "nothing else", [["preview", "UsdPreviewSurface"], ["openpbr", "OpenPBR"], ["gltf", "glTF"]]],
+  ],
+  "bake-thickness": [
+    ["along", "Measured along", "the way straight in", [["refracted", "the refracted way"]]],
+    ["texture", "Kept in", "primvars", texels(256, 512, 1024)],
+  ],
+  "bake-probes": [["resolution", "Texels of a face", "each probe's own", texels(64, 128, 256)]],
+};
 let given = null; // {kind, source, job, found} of what is shown
 let asking = null;
 
@@ -65,16 +84,21 @@ function converted({ materials = [], notices = [] }) {
   return { title: done ? `${counted(done, "material")} described` : "No material had to be described", rows: [...findingRows(notices), ...rows] };
 }
 
-const SHOWN = { inspect: inspected, validate: validated, convert: converted };
+function baked({ summary, prims = [], notices = [] }) {
+  return { title: summary, rows: [...findingRows(notices), ...prims.map((one) => ({ word: "done", ...one }))] };
+}
 
-async function ask(kind) {
+const SHOWN = { inspect: inspected, validate: validated, convert: converted, "bake-thickness": baked, "bake-probes": baked };
+
+async function ask(kind, settings = {}) {
   asking?.abort();
   const mine = (asking = new AbortController());
   const { source } = state;
   given = null;
+  if (!Object.keys(settings).length) drawOptions(kind);
   show(`${DOING[kind]} ${source.name} …`, []);
   try {
-    const { body, headers } = bodyOf({});
+    const { body, headers } = bodyOf(settings);
     const answer = await send(`v1/${kind}`, { method: "POST", body, headers: { ...headers, Accept: "application/json" }, signal: mine.signal });
     const job = /jobs\/([^/]+)/.exec(answer.headers.get("Content-Location") ?? "")?.[1];
     const found = await answer.json();
@@ -82,7 +106,7 @@ async function ask(kind) {
     given = { kind, source, job, found };
     const { title, rows } = SHOWN[kind](found);
     show(title, rows);
-    $("checked").focus({ preventScroll: true });
+    if (!$("checked-options").contains(document.activeElement)) $("checked").focus({ preventScroll: true });
   } catch (error) {
     if (asking !== mine) return;
     closeChecks();
@@ -90,12 +114,25 @@ async function ask(kind) {
   }
 }
 
+/** Choices of a verb that makes a stage; another choice asks again. */
+function drawOptions(kind) {
+  const fields = (OPTIONS[kind] ?? []).map(([name, label, rest, values]) => {
+    const choice = make("select", { id: `option-${name}`, onchange: () => ask(kind, chosen()) },
+      make("option", { value: "", textContent: rest }), ...values.map(([value, textContent]) => make("option", { value, textContent })));
+    return { name, values, choice, node: make("span", { className: "field inline" }, make("label", { htmlFor: choice.id, textContent: label }), choice) };
+  });
+  const chosen = () => Object.fromEntries(fields.filter(({ choice }) => choice.value)
+    .map(({ name, values, choice }) => [name, values[choice.selectedIndex - 1][0]]));
+  $("checked-options").replaceChildren(...fields.map(({ node }) => node));
+  $("checked-options").hidden = !fields.length;
+}
+
 function show(title, rows) {
   $("checked").hidden = false;
   $("checked-title").textContent = title;
   $("checked-found").replaceChildren(...(rows.length ? [listOf(rows)] : []));
   $("take-report").hidden = !given;
-  $("take-stage").hidden = given?.kind !== "convert" || !given.job;
+  $("take-stage").hidden = !MADE[given?.kind] || !given.job;
   for (const kind of KINDS) $(kind).setAttribute("aria-pressed", String(given?.kind === kind));
 }
 
@@ -106,10 +143,10 @@ export function closeChecks() {
   $("checked").hidden = true;
 }
 
-const named = (ending) => pictureName(given.source.name).replace(/png$/, ending);
+const named = (ending) => fileName(given.source.name, ending);
 
 async function takeStage() {
-  const name = named("converted.usdz");
+  const name = named(MADE[given.kind]);
   try {
     download(await (await send(`v1/jobs/${given.job}/file`, { headers: { Accept: "model/vnd.usdz+zip" } })).blob(), name);
   } catch (error) {

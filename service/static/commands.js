@@ -7,7 +7,7 @@ export function quoted(word) {
 
 /** The same render by curl. A file is named as it was here: run it beside that file. */
 export function asCurl(url, source, request) {
-  const end = `${quoted(url)} -o ${quoted(pictureName(source.name))}`;
+  const end = `${quoted(url)} -o ${quoted(fileName(source.name, "png"))}`;
   if (!source.file) {
     const body = JSON.stringify({ stage: source.name, ...request });
     return `curl --fail-with-body -H 'Content-Type: application/json' -d ${quoted(body)} ${end}`;
@@ -17,13 +17,14 @@ export function asCurl(url, source, request) {
   return `curl --fail-with-body -F ${quoted(`stage=@${asFile(source.name)}`)}${parts} --form-string ${quoted(`settings=${JSON.stringify(request)}`)} ${end}`;
 }
 
-export const pictureName = (name) => `${name.replace(/^.*\//, "").replace(/\.(usd[acz]?|glb|gltf|zip)$/i, "")}.png`;
+/** What a file made of a stage is called: the stage's own name, with another ending. */
+export const fileName = (name, ending) => `${name.replace(/^.*\//, "").replace(/\.(usd[acz]?|glb|gltf|zip)$/i, "")}.${ending}`;
 
 /** The same render by the command line. */
 export function asCli(source, request) {
   const { overrides = {}, time_code: time = null, ...flags } = request;
-  const hashes = time === null ? "" : Number.isInteger(time) ? ".####" : ".####.###";
-  const words = ["refract", "render", source.name, pictureName(source.name).replace(/\.png$/, `${hashes}.png`)];
+  const hashes = time === null ? "" : Number.isInteger(time) ? "####." : "####.###.";
+  const words = ["refract", "render", source.name, fileName(source.name, `${hashes}png`)];
   for (const [name, value] of Object.entries(flags)) {
     const flag = `--${name.replaceAll("_", "-")}`;
     words.push(...(String(value).startsWith("-") ? [`${flag}=${value}`] : [flag, String(value)]));

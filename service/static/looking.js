@@ -1,14 +1,16 @@
 // How large the picture is on the screen, and what its pixels say. Neither makes another picture: wheel, drag and two fingers do.
 
-import { $ } from "./dom.js";
-import { shownRun } from "./jobs.js";
-import { UNITS, pixelText } from "./planes.js";
+import { $, make } from "./dom.js";
+import { plane, shownRun } from "./jobs.js";
+import { AOVS, UNITS, WHOLE, pixelText, whiteOf } from "./planes.js";
+import { report } from "./problems.js";
 import { sides, state } from "./state.js";
-import { painted, whiteOf } from "./view.js";
+import { painted } from "./view.js";
 
 const ROOM = 48; // [CSS pixels] of the window's height that a picture leaves free
 const HINT = "Point at the picture, or tap it, to read a pixel.";
 let actual = false;
+let asking = 0; // for planes: a newer place makes an older one's answer void
 let place = null; // shares of the picture's width and height that are read
 
 const isFull = () => document.fullscreenElement === $("figure");
@@ -30,6 +32,8 @@ export function showSize() {
 /** The values under the place that is read, of each side. */
 export function showReading() {
   $("mark").hidden = !place?.marked || !painted.length;
+  $("planes").hidden = !painted.length;
+  showPlanes();
   if (!place || !painted.length) {
     $("readout").textContent = HINT;
     return;
@@ -38,20 +42,46 @@ export function showReading() {
   const [{ data: first }] = painted;
   const [column, row] = pixelAt(first);
   const said = painted.map(({ side, run, data, mask }) => {
-    const text = state.view in UNITS && valueAt(mask)[0] === 0 ? "no glass" : pixelText(state.view, valueAt(data), whiteOf(run));
+    const text = textAt(state.view, run, data, mask);
     return state.compare ? `${side.toUpperCase()} ${text}` : text;
   });
   $("readout").textContent = `Pixel ${column}, ${row}: ${$("view").selectedOptions[0]?.textContent} ${said.join("; ")}`;
 }
 
-function pixelAt({ width, height }) {
-  return [[place.right, width], [place.down, height]].map(([share, count]) => Math.min(Math.max(Math.floor(share * count), 0), count - 1));
+/** Every plane at the place that is read, of each side; what was read last stays. They are fetched when first wanted. */
+async function showPlanes() {
+  if (!$("planes").open || !painted.length) return;
+  const [turn, at] = [++asking, place];
+  const names = ["beauty", ...AOVS];
+  try {
+    const shown = await Promise.all(painted.map(async ({ side, run }) => {
+      const found = await Promise.all(names.map(async (name) => [name, (await plane(run, name)).pixels]));
+      return { side, run, pixels: Object.fromEntries(found) };
+    }));
+    if (turn !== asking || !at) return;
+    const row = (tag, first, words) => make("tr", {}, make("th", { textContent: first }), ...words.map((textContent) => make(tag, { textContent })));
+    const [column, line] = pixelAt(shown[0].pixels.beauty, at);
+    $("planes-head").replaceChildren(row("th", `Pixel ${column}, ${line}`, shown.map(({ side }) => (state.compare ? side.toUpperCase() : "value"))));
+    $("planes-found").replaceChildren(...names.map((name) => row("td",
+      $("view").querySelector(`[value="${name}"]`).textContent, shown.map(({ run, pixels }) => textAt(name, run, pixels[name], pixels.mask, at)))));
+  } catch (error) {
+    if (turn === asking) report(error);
+  }
 }
 
-function valueAt(pixels) {
-  const [column, row] = pixelAt(pixels);
-  const at = 4 * (row * pixels.width + column);
-  return pixels.data.slice(at, at + 3);
+function textAt(name, run, data, mask, at = place) {
+  const glass = WHOLE.includes(name) || !(name in UNITS) || valueAt(mask, at)[0] > 0;
+  return glass ? pixelText(name, valueAt(data, at), whiteOf(run, name)) : "no glass";
+}
+
+function pixelAt({ width, height }, at = place) {
+  return [[at.right, width], [at.down, height]].map(([share, count]) => Math.min(Math.max(Math.floor(share * count), 0), count - 1));
+}
+
+function valueAt(pixels, at) {
+  const [column, row] = pixelAt(pixels, at);
+  const first = 4 * (row * pixels.width + column);
+  return pixels.data.slice(first, first + 3);
 }
 
 function read(event) {
@@ -74,6 +104,7 @@ export function wireLooking() {
   $("full").onclick = () => (isFull() ? document.exitFullscreen() : $("figure").requestFullscreen()).catch(() => {});
   document.addEventListener("fullscreenchange", showSize);
   addEventListener("resize", showSize);
+  $("planes").ontoggle = showReading;
   $("views").addEventListener("pointerdown", read);
   $("views").addEventListener("pointermove", (event) => {
     if (event.pointerType === "mouse" && !event.buttons) read(event);

@@ -1,7 +1,7 @@
 // What can be taken away: commands, a link, files.
 
 import { bodyOf, send } from "./api.js";
-import { asCli, asCurl, pictureName } from "./commands.js";
+import { asCli, asCurl, fileName } from "./commands.js";
 import { $, download, say } from "./dom.js";
 import { plane } from "./jobs.js";
 import { toFragment } from "./link.js";
@@ -39,7 +39,7 @@ async function save(kind) {
   const run = state.runs[state.edit];
   try {
     const blob = kind === "png" ? (await plane(run, state.view)).blob : await exr();
-    download(blob, pictureName(state.source.name).replace(/png$/, kind));
+    download(blob, fileName(state.source.name, kind));
   } catch (error) {
     report(error);
   }

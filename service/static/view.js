@@ -3,7 +3,7 @@
 import { $ } from "./dom.js";
 import { plane, shownRun } from "./jobs.js";
 import { keepAddress } from "./link.js";
-import { RAMP, SCALARS, UNITS, falseColour } from "./planes.js";
+import { RAMP, SCALARS, UNITS, WHOLE, falseColour, whiteOf } from "./planes.js";
 import { clearProblem, report } from "./problems.js";
 import { SIDES, sides, state, tell } from "./state.js";
 
@@ -27,7 +27,7 @@ export async function paint() {
     if (turn === painting) report(error);
   }
   if (turn !== painting) return;
-  const high = Math.max(1e-9, ...loaded.map(({ run }) => whiteOf(run)));
+  const high = Math.max(1e-9, ...loaded.map(({ run }) => whiteOf(run, state.view)));
   for (const side of SIDES) {
     const one = loaded.find((entry) => entry.side === side);
     const frame = sides().includes(side) ? state.moving[side] : null;
@@ -47,24 +47,22 @@ function drawFrame(canvas, frame) {
   canvas.getContext("2d").drawImage(frame, 0, 0);
 }
 
-/** What white stands for in a run's PNG of the plane that is looked at. */
-export const whiteOf = (run) => run.job.aovs?.find(({ name }) => name === state.view)?.white ?? 1;
-
 function draw(canvas, { side, run, beauty, data, mask }, scalar, high) {
   Object.assign(canvas, { width: data.width, height: data.height });
   canvas.classList.toggle("old", run !== state.runs[side]);
-  canvas.getContext("2d").putImageData(scalar ? coloured(beauty, data, mask, whiteOf(run) / high) : data, 0, 0);
+  canvas.getContext("2d").putImageData(scalar ? coloured(beauty, data, mask, whiteOf(run, state.view) / high) : data, 0, 0);
   const what = $("view").selectedOptions[0]?.textContent ?? state.view;
   canvas.setAttribute("aria-label", `${what} of ${state.source.name}, setting ${side.toUpperCase()}, ${data.width} by ${data.height} pixels`);
 }
 
-/** False colour where there is glass, the picture in dark grey elsewhere. White of `data` is `scale` of the ramp. */
+/** False colour where there is glass, or everywhere, and the picture in dark grey elsewhere. White of `data` is `scale` of the ramp. */
 function coloured(beauty, data, mask, scale) {
   const out = new ImageData(data.width, data.height);
+  const whole = WHOLE.includes(state.view);
   const ramp = Array.from({ length: 256 }, (_, value) => falseColour((value / 255) * scale));
   for (let at = 0; at < out.data.length; at += 4) {
     const grey = 0.35 * (0.3 * beauty.data[at] + 0.6 * beauty.data[at + 1] + 0.1 * beauty.data[at + 2]);
-    const share = mask.data[at] / 255;
+    const share = whole ? 1 : mask.data[at] / 255;
     const colour = ramp[data.data[at]];
     for (let channel = 0; channel < 3; channel++) out.data[at + channel] = share * colour[channel] + (1 - share) * grey;
     out.data[at + 3] = 255;
@@ -81,7 +79,7 @@ function showFigure(loaded, scalar, high) {
   $("legend").hidden = !scalar || !loaded.length;
   $("legend-low").textContent = `0${UNITS[state.view] ?? ""}`;
   $("legend-high").textContent = `${Number(high.toPrecision(3))}${UNITS[state.view] ?? ""}`;
-  $("legend-text").textContent = "Grey: no glass.";
+  $("legend-text").textContent = WHOLE.includes(state.view) ? "" : "Grey: no glass.";
   $("legend-bar").style.background = `linear-gradient(90deg, ${RAMP.map((colour) => `rgb(${colour.join(" ")})`).join(", ")})`;
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import tempfile
 from pathlib import Path
@@ -71,8 +72,9 @@ def is_over(out: str, stage: str, *, made: str) -> bool:
     record = layer.customLayerData.get(RECORD) if layer else None
     if not isinstance(record, dict) or record.get("made") != made:
         return False
-    below = os.path.join(os.path.dirname(os.path.abspath(out)), str(record.get("stage", "")))
-    return _real(below) == _real(stage)
+    told = str(record.get("stage", ""))
+    below = os.path.join(os.path.dirname(os.path.abspath(out)), told)
+    return told == _placeless(stage) or _real(below) == _real(stage)
 
 
 def _real(path: str) -> str:
@@ -194,7 +196,15 @@ def _record_relative(layer: Sdf.Layer, out: str) -> None:
     data: dict[str, Any] = dict(layer.customLayerData)
     record = data.get(RECORD)
     if isinstance(record, dict) and "stage" in record:
-        layer.customLayerData = {**data, RECORD: {**record, "stage": _relative(str(record["stage"]), out)}}
+        stage = _relative(str(record["stage"]), out)
+        if out.lower().endswith(".usdz") and os.path.isabs(outer_of(stage)):
+            stage = _placeless(stage)
+        layer.customLayerData = {**data, RECORD: {**record, "stage": stage}}
+
+
+def _placeless(path: str) -> str:
+    """A file's name and a digest of where it lies: enough to know it again, and no folder is told."""
+    return f"{os.path.basename(path)} {hashlib.sha256(_real(path).encode()).hexdigest()[:16]}"
 
 
 def _relative(asset: str, out: str) -> str:
