@@ -12,7 +12,8 @@ from scipy.spatial import ConvexHull
 F64 = NDArray[np.float64]
 FOLDER = Path(__file__).parent / "good" / "parts"
 # Corners of what is turned on a lathe: radius and height in centimetres. They are a cage: the surface is the limit of
-# its subdivision, so two corners close together are a sharp edge. A body that begins and ends on the axis is closed; one that does not is a ring.
+# its subdivision, so two corners close together are a sharp edge.
+# A body that begins and ends on the axis is closed; one that does not is a ring.
 LATHED: dict[str, tuple[str, list[tuple[float, float]]]] = {
     "bottle": (
         "The glass of a bottle, 24 cm tall: outside and inside are one closed surface.",
@@ -80,8 +81,8 @@ LATHED: dict[str, tuple[str, list[tuple[float, float]]]] = {
     ),
     "bulb": (
         "The glass of a bulb, 2 cm wide: outside and inside are one closed surface.",
-        [(0, 3.5), (0.6, 3.22), (0.9, 2.5), (0.85, 1.6), (0.56, 0.2), (0.5, -0.8), (0.57, -0.9), (0.64, -0.8), (0.66, 0.2),
-         (0.95, 1.6), (1, 2.5), (0.7, 3.3), (0, 3.6)],
+        [(0, 3.5), (0.6, 3.22), (0.9, 2.5), (0.85, 1.6), (0.56, 0.2), (0.5, -0.8), (0.57, -0.9), (0.64, -0.8),
+         (0.66, 0.2), (0.95, 1.6), (1, 2.5), (0.7, 3.3), (0, 3.6)],
     ),
     "bezel": (
         "The ring around a headlight.",
@@ -107,7 +108,6 @@ def main() -> None:
     _write("vase", "An open surface of revolution, 1.05 m tall.", *vase())
     for name, (doc, profile) in LATHED.items():
         _write(name, doc, *lathe(profile), None, unit=0.01, scheme="catmullClark")
-    _write("drop", "A cut drop of crystal, 2 wide and 5 tall.", *drop())
     _write("daisy", "Twenty narrow petals.", *blossom(20, 0.16, 1.0, 0.16, 0.05), None, scheme="catmullClark")
     _write("tulip", "Six petals that make a cup.", *blossom(6, 0.5, 0.42, 1.15, 0.3), None, scheme="catmullClark")
     _write("leaf", "A leaf that bends down.", *blossom(1, 0.14, 1.0, -0.25, 0.1), None, scheme="catmullClark")
@@ -150,12 +150,6 @@ def gem(size: float = 0.62) -> tuple[F64, list[list[int]], None]:
     return _hull(size * np.vstack([_circle(n, radius, height, turn) for n, turn, radius, height in levels]))
 
 
-def drop() -> tuple[F64, list[list[int]], None]:
-    """A long drop with eight sides, pointed above and below."""
-    levels = ((1, 0.0, 0.0, 2.0), (8, 0.0, 0.55, 1.2), (8, 0.5, 1.0, -1.4), (8, 0.0, 0.85, -2.1), (1, 0.0, 0.0, -3.0))
-    return _hull(np.vstack([_circle(n, radius, height, turn) for n, turn, radius, height in levels]))
-
-
 def blossom(petals: int, wide: float, far: float, tall: float, cup: float) -> tuple[F64, list[list[int]]]:
     """Cages of petals around y: half width, reach, height of the tips, and how far their edges stand up."""
     along, across = np.linspace(0.0, 1.0, 6), np.array([-1.0, 0.0, 1.0])
@@ -166,7 +160,7 @@ def blossom(petals: int, wide: float, far: float, tall: float, cup: float) -> tu
         lift = 1.0 + 0.25 * (petal % 2)
         out, beside = np.array([np.cos(angle), 0, np.sin(angle)]), np.array([-np.sin(angle), 0, np.cos(angle)])
         for v, w in zip(along, half, strict=True):
-            reach = far * (np.sin(2.3 * v) / 1.0 if tall > far else v)
+            reach = far * (np.sin(2.3 * v) if tall > far else v)
             for u in across:
                 points.append(out * (0.06 + reach) + beside * w * u + [0.0, lift * tall * v * v + cup * w * u * u, 0.0])
         number = np.arange(len(points) - 18, len(points)).reshape(6, 3)
@@ -191,7 +185,7 @@ def tank(x: float = 32.0, y: float = 36.0, z: float = 16.0, pane: float = 0.8) -
     """A box without a lid, in centimetres: outside, inside and rim."""
     square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
     levels = ((0.0, 0.0), (0.0, y), (pane, y), (pane, pane))  # how far inside, and the height
-    points = np.vstack([np.stack([s[0] * (x - off), h + 0 * off, s[1] * (z - off)]) for off, h in levels for s in square])
+    points = np.array([(a * (x - off), h, b * (z - off)) for off, h in levels for a, b in square])
     number = np.arange(16).reshape(4, 4)
     beside = np.roll(number, -1, axis=1)
     faces = np.stack([number[:-1], number[1:], beside[1:], beside[:-1]], axis=-1).reshape(-1, 4).tolist()
