@@ -12,7 +12,8 @@ from scipy.spatial import ConvexHull
 F64 = NDArray[np.float64]
 FOLDER = Path(__file__).parent / "good" / "parts"
 # Corners of what is turned on a lathe: radius and height in centimetres. They are a cage: the surface is the limit of
-# its subdivision, so two corners close together are a sharp edge. A body that begins and ends on the axis is closed.
+# its subdivision, so two corners close together are a sharp edge.
+# A body that begins and ends on the axis is closed; one that does not is a ring.
 LATHED: dict[str, tuple[str, list[tuple[float, float]]]] = {
     "bottle": (
         "The glass of a bottle, 24 cm tall: outside and inside are one closed surface.",
@@ -57,6 +58,41 @@ LATHED: dict[str, tuple[str, list[tuple[float, float]]]] = {
         "A flame, 2.6 cm tall.",
         [(0, 7.75), (0.2, 7.8), (0.42, 8.3), (0.44, 8.8), (0.3, 9.5), (0.1, 10.3), (0, 10.6)],
     ),
+    "jar": (
+        "A vase of glass, 21 cm tall, with a wall of 3 mm and a thick bottom: a closed surface.",
+        [(0, 0.15), (2.6, 0.15), (3, 0), (3.6, 0), (3.8, 0.2), (4, 0.8), (4.9, 4), (5, 7), (4, 11), (3, 15), (3.3, 18),
+         (4.2, 20.6), (4.3, 20.85), (4.15, 20.95), (4, 20.8), (3.05, 18), (2.72, 15), (3.7, 11), (4.68, 7), (4.58, 4),
+         (3.7, 1.8), (3.4, 1.4), (2.6, 1.3), (0, 1.3)],
+    ),
+    "water": (
+        "What is in the vase: it reaches into the glass, which has the higher priority.",
+        [(0, 0.9), (2.6, 0.9), (3.5, 1), (3.9, 1.8), (4.72, 4), (4.82, 7), (3.84, 11), (3.38, 12.9), (3.34, 13),
+         (3.2, 13), (2, 13), (0, 13)],
+    ),
+    "reflector": (
+        "The bowl of a headlight, a shell: a parabola whose focus is 2.5 cm above its bottom, 16 cm wide.",
+        [(1.5, -1), (2, 0), (4.2, 1.3), (6.3, 3.4), (8.2, 6.4), (8.1, 6.5), (8, 6.4), (6, 3.6), (4, 1.6), (2, 0.4),
+         (1.3, 0.17), (1.2, 0.15), (1.2, -1)],
+    ),
+    "cover": (
+        "The clear cover of a headlight, 17 cm wide and 5 mm thick.",
+        [(0, 8.8), (3, 8.6), (6, 7.9), (7.9, 7), (8.4, 6.8), (8.5, 6.9), (8.5, 7.1), (8.4, 7.25), (7.9, 7.5),
+         (6, 8.42), (3, 9.1), (0, 9.3)],
+    ),
+    "bulb": (
+        "The glass of a bulb, 2 cm wide: outside and inside are one closed surface.",
+        [(0, 3.5), (0.6, 3.22), (0.9, 2.5), (0.85, 1.6), (0.56, 0.2), (0.5, -0.8), (0.57, -0.9), (0.64, -0.8),
+         (0.66, 0.2), (0.95, 1.6), (1, 2.5), (0.7, 3.3), (0, 3.6)],
+    ),
+    "bezel": (
+        "The ring around a headlight.",
+        [(8.2, 5.5), (9.2, 5.4), (9.4, 5.6), (9.5, 6.4), (9.3, 7.3), (8.8, 7.6), (8.35, 7.4), (8.1, 6.9), (8.05, 6.2)],
+    ),
+    "pod": (
+        "The body of a headlight, behind the ring.",
+        [(0, -15), (1.5, -14.6), (4, -12), (7, -6), (8.8, 0), (9.3, 5.6), (9.2, 6), (9, 6), (8.9, 5.5), (8.4, 0),
+         (6.6, -5.6), (3, -9), (0, -10)],
+    ),
     "lens": (
         "A lens with two sides alike, 9 cm wide and 2 cm thick, lying on its lower side.",
         [(0, 0), (1.2, 0.06), (2.4, 0.27), (3.5, 0.58), (4.35, 0.88), (4.45, 0.92), (4.5, 0.96), (4.5, 1.04),
@@ -72,6 +108,11 @@ def main() -> None:
     _write("vase", "An open surface of revolution, 1.05 m tall.", *vase())
     for name, (doc, profile) in LATHED.items():
         _write(name, doc, *lathe(profile), None, unit=0.01, scheme="catmullClark")
+    _write("daisy", "Twenty narrow petals.", *blossom(20, 0.16, 1.0, 0.16, 0.05), None, scheme="catmullClark")
+    _write("tulip", "Six petals that make a cup.", *blossom(6, 0.5, 0.42, 1.15, 0.3), None, scheme="catmullClark")
+    _write("leaf", "A leaf that bends down.", *blossom(1, 0.14, 1.0, -0.25, 0.1), None, scheme="catmullClark")
+    _write("fish", "A fish, 4 long, that swims along +x.", *fish(), None, scheme="catmullClark")
+    _write("tank", "Five panes of glass in one closed surface, 64 cm wide.", *tank(), None, unit=0.01)
     points, faces, colors = rose()
     tint = f"    color3f[] primvars:refraction:transmittanceColor = [{_text(colors)}] (\n"
     tint += '        interpolation = "uniform"\n    )'
@@ -106,7 +147,53 @@ def gem(size: float = 0.62) -> tuple[F64, list[list[int]], None]:
         (8, 0.5, 0.45, -0.50),
         (1, 0.0, 0.0, -0.86),
     ]
-    corners = size * np.vstack([_circle(n, radius, height, turn) for n, turn, radius, height in levels])
+    return _hull(size * np.vstack([_circle(n, radius, height, turn) for n, turn, radius, height in levels]))
+
+
+def blossom(petals: int, wide: float, far: float, tall: float, cup: float) -> tuple[F64, list[list[int]]]:
+    """Cages of petals around y: half width, reach, height of the tips, and how far their edges stand up."""
+    along, across = np.linspace(0.0, 1.0, 6), np.array([-1.0, 0.0, 1.0])
+    half = wide * np.sin(np.pi * (0.08 + 0.86 * along)) ** 0.7
+    points, faces = [], []
+    for petal in range(petals):
+        angle = 2.0 * np.pi * petal / petals
+        lift = 1.0 + 0.25 * (petal % 2)
+        out, beside = np.array([np.cos(angle), 0, np.sin(angle)]), np.array([-np.sin(angle), 0, np.cos(angle)])
+        for v, w in zip(along, half, strict=True):
+            reach = far * (np.sin(2.3 * v) if tall > far else v)
+            for u in across:
+                points.append(out * (0.06 + reach) + beside * w * u + [0.0, lift * tall * v * v + cup * w * u * u, 0.0])
+        number = np.arange(len(points) - 18, len(points)).reshape(6, 3)
+        cells = (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1])
+        faces += np.stack(cells, axis=-1).reshape(-1, 4).tolist()
+    return np.array(points), faces
+
+
+def fish() -> tuple[F64, list[list[int]]]:
+    """The cage of a body, flat to both sides, whose last rings are the tail."""
+    rings = [(2.0, 0.22, 0.16), (1.5, 0.62, 0.34), (0.6, 1.0, 0.44), (-0.5, 0.86, 0.34), (-1.2, 0.3, 0.14),
+             (-1.5, 0.34, 0.08), (-2.0, 1.05, 0.05), (-2.1, 1.0, 0.04)]  # fmt: skip
+    angle = 2.0 * np.pi * np.arange(8) / 8
+    points = np.vstack([np.stack([0 * angle + x, h * np.sin(angle), w * np.cos(angle)], axis=-1) for x, h, w in rings])
+    number = np.arange(len(points)).reshape(-1, 8)
+    beside = np.roll(number, -1, axis=1)
+    faces = np.stack([number[:-1], number[1:], beside[1:], beside[:-1]], axis=-1).reshape(-1, 4).tolist()
+    return points, [*faces, number[0][::-1].tolist(), number[-1].tolist()]
+
+
+def tank(x: float = 32.0, y: float = 36.0, z: float = 16.0, pane: float = 0.8) -> tuple[F64, list[list[int]]]:
+    """A box without a lid, in centimetres: outside, inside and rim."""
+    square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    levels = ((0.0, 0.0), (0.0, y), (pane, y), (pane, pane))  # how far inside, and the height
+    points = np.array([(a * (x - off), h, b * (z - off)) for off, h in levels for a, b in square])
+    number = np.arange(16).reshape(4, 4)
+    beside = np.roll(number, -1, axis=1)
+    faces = np.stack([number[:-1], number[1:], beside[1:], beside[:-1]], axis=-1).reshape(-1, 4).tolist()
+    return points, [*faces, number[0].tolist(), number[-1][::-1].tolist()]
+
+
+def _hull(corners: F64) -> tuple[F64, list[list[int]], None]:
+    """The convex hull; its flat facets are merged into polygons."""
     hull = ConvexHull(corners)
     facets: dict[tuple[float, ...], set[int]] = {}
     for triangle, plane in zip(hull.simplices, hull.equations, strict=True):
@@ -152,6 +239,12 @@ def lathe(profile: Sequence[tuple[float, float]], around: int = 16) -> tuple[F64
     """The cage of a closed body of revolution around y, whose limit has the radii that are given."""
     widen = 3.0 / (2.0 + np.cos(2.0 * np.pi / around))  # a cubic spline runs inside of its polygon
     radius, height = np.array(profile, dtype=np.float64).T
+    if radius[0] > 0.0:  # a ring, whose last corner meets its first
+        points = np.vstack([_circle(around, widen * r, y) for r, y in profile])
+        number = np.arange(len(points)).reshape(-1, around)
+        ahead, beside = np.roll(number, -1, axis=0), np.roll(number, -1, axis=1)
+        cells = (number, ahead, np.roll(ahead, -1, axis=1), beside)
+        return points, np.stack(cells, axis=-1).reshape(-1, 4).tolist()
     rings = [_circle(around, widen * r, y) for r, y in zip(radius[1:-1], height[1:-1], strict=True)]
     points = np.vstack([*rings, [[0.0, height[0], 0.0], [0.0, height[-1], 0.0]]])
     number = np.arange(len(rings) * around).reshape(-1, around)
