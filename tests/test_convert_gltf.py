@@ -209,6 +209,13 @@ def test_what_cannot_be_read_says_so(tmp_path: Path) -> None:
     (tmp_path / "bad.glb").write_bytes(b"nothing of the kind")
     with pytest.raises(StageError, match="glTF"):
         run(str(tmp_path / "bad.glb"), out)
+    (tmp_path / "bad.glb").write_bytes(b"glTF")
+    with pytest.raises(StageError, match="cut off"):
+        run(str(tmp_path / "bad.glb"), out)
+    made = shop(tmp_path)
+    made.document["asset"]["version"] = "1.0"
+    with pytest.raises(StageError, match=r"glTF 1\.0"):
+        run(made.text(tmp_path / "old.gltf"), out)
     made = shop(tmp_path)
     made.document["extensionsRequired"] = ["KHR_draco_mesh_compression"]
     with pytest.raises(StageError, match="KHR_draco_mesh_compression"):

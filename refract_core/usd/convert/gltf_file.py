@@ -136,13 +136,18 @@ def read_gltf(path: str) -> Gltf:
         document = pygltflib.GLTF2.load(path)
         if document is None:
             raise ValueError("it is empty")
+        version = str(document.asset.version)
+        if not version.startswith("2."):
+            raise StageError(f"{path}: is glTF {version}, and 2.0 is read; save it anew with what made it")
         needed = [name for name in document.extensionsRequired or [] if name in _UNREADABLE]
         if needed:
             raise StageError(f"{path}: its geometry is compressed with {', '.join(needed)}; save it without")
         return _read(_File(path, document))
     except StageError:
         raise
-    except (ValueError, LookupError, TypeError, AttributeError, OSError, struct.error) as error:
+    except struct.error as error:
+        raise StageError(f"{path}: cannot be read as glTF 2.0: it was cut off; copy or save it again") from error
+    except (ValueError, LookupError, TypeError, AttributeError, OSError) as error:
         raise StageError(f"{path}: cannot be read as glTF 2.0: {error}") from error
 
 
