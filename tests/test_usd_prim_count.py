@@ -91,7 +91,8 @@ def test_no_number_grows_beyond_its_ceiling() -> None:
 def test_samples_are_counted_as_usd_does(path: Path) -> None:
     """And what its point instancers draw: of each place one prim, in the samples."""
     layer = Sdf.Layer.FindOrOpen(str(path))
-    instancers = [UsdGeom.PointInstancer(prim) for prim in Usd.Stage.Open(layer).Traverse()]
+    stage = Usd.Stage.Open(layer)
+    instancers = [UsdGeom.PointInstancer(prim) for prim in stage.Traverse()]
     places = [one.GetProtoIndicesAttr().Get() for one in instancers if one]
     assert count_prims(str(path)).prims == composed(layer) + sum(map(len, places))
 
