@@ -85,6 +85,14 @@ def test_glass_of_index_one_changes_no_light(name: str, shape: str) -> None:
     assert np.abs(blocks - 1.0).max() < 0.12
 
 
+def test_even_light_through_glass_is_quiet() -> None:
+    """Under a wide box of index 1 in the sun some 10 photons fall on a pixel, which alone would stray by a third."""
+    body = box("/body", (1.0, 0.2, 1.0), 1, centre=(0, 0.8, 0))
+    bare = arriving(lit(WHITE, [], fov=0.3, lights=(SUN,)))
+    through = arriving(lit(glass(Model.TRACED, 1.0), [body], fov=0.3, lights=(SUN,)), photons=1 << 15)
+    assert (through / bare).std() < 0.03
+
+
 @pytest.mark.parametrize("degrees", [20.0, 35.0, 44.0])
 def test_a_slope_gets_as_much_as_without_the_glass(degrees: float) -> None:
     """Texels are squares seen along an axis of the world: on a slope they are larger than they look."""
