@@ -308,6 +308,10 @@ MUTANTS = (
     # --- what glows
     Mutant("every node is far enough to be a point", "world/glow.py", "_FAR = 8.0", "_FAR = 1.0", GLOWS),
     Mutant("every node is flat", "world/glow.py", "_FLAT = 0.985", "_FLAT = 0.0", GLOWS),
+    Mutant("what glows has no depth from afar", "world/glow_views.py",
+           "first = dot(seen.place, n) +", "first = 0.0 * dot(seen.place, n) +", GLOWS),
+    Mutant("a table is looked at from the other side", "world/glow.py",
+           "w = scale(to, -1.0 / d)", "w = scale(to, 1.0 / d)", GLOWS),
     Mutant("what glows shines backwards, too", "world/glow.py",
            "if toward > 0.0:\n                axes", "if True:\n                axes", GLOWS),
     Mutant("points on what glows count alike", "world/lights.py",

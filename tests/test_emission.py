@@ -328,6 +328,37 @@ def test_what_arrives_of_any_triangles(seed: int) -> None:
     assert (np.abs(to[k][:, None] - middle) <= half).all(2).any(1).all()
 
 
+@pytest.mark.parametrize("shape", ["globe", "box", "bent"])
+def test_from_far_away_a_body_is_one_thing(shape: str) -> None:
+    """At receivers that are 17 to 60 of its radii away and look at it: as by quadrature, its depth and all."""
+    rng = np.random.default_rng(11)
+    middle = rng.uniform(-1.0, 1.0, 3)
+    body = box("/body", (0.05, 0.11, 0.08), 0, centre=tuple(middle))
+    if shape != "box":
+        body = globe("/body", 0.1, 0, 16, tuple(middle))
+    if shape == "bent":  # a boat, that is not round, nor like itself from behind
+        points = body.points - middle
+        points = points * (1.0, 0.5, 2.0) + (0.0, 6.0, 0.0) * points[:, 2:] ** 2 + middle
+        body = replace(body, points=points.astype(np.float32))
+    what = scene([body], [material("/m", EMISSIVE=1.0, DIFFUSE=0.0)])
+    corners = body.points[body.triangles].astype(np.float64)
+    radius = np.linalg.norm(corners - corners.mean((0, 1)), axis=2).max()
+    ways = rng.normal(size=(60, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    points = corners.mean((0, 1)) + ways * radius * rng.uniform(17.0, 60.0, (60, 1))
+    normals = -ways + rng.uniform(-0.5, 0.5, (60, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    found, to = np.zeros((60, 3)), np.zeros((60, 1, 3))
+    _ask(Pointer(table_of(what)), points, normals, np.full((1, 2), 0.5), found, to)
+    white = np.ones((len(corners), 3))
+    expected = np.array(
+        [arrives(corners, white, p, lambda d: np.maximum(0.0, d @ n), 8) for p, n in zip(points, normals, strict=True)]  # noqa: B023
+    )
+    np.testing.assert_allclose(found, expected, rtol=0.04)  # where a face just comes into sight
+    assert np.abs(found - expected).mean() < 0.008 * expected.mean()
+    assert found.mean() == pytest.approx(expected.mean(), rel=0.007)
+
+
 @pytest.mark.parametrize("alpha", [0.05, 0.15, 0.4, 0.9])
 @pytest.mark.parametrize("seed", range(6))
 def test_the_highlight_of_any_triangles(seed: int, alpha: float) -> None:

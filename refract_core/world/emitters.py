@@ -18,9 +18,10 @@ from ..kernels.arrays import F64_2D, F64_3D, I32_1D
 from ..kernels.compile import inlined, kernel
 from ..kernels.lanes import by_address, put
 from ..kernels.vec import along, cross, length, sub
-from ..scene import F64, Light, LightKind, Param, Scene
+from ..scene import F32, F64, Light, LightKind, Param, Scene
 from .environment import TEXEL_LUMINANCE
-from .glow import Glow, GlowTree, no_glow
+from .glow import FLAT, Glow, GlowTree, no_glow
+from .glow_views import ROWS, bodies_of, joined, tables_of
 from .solid import across, along_a_curve, areas, by_halves, encloses
 from .surface import Hit, Interaction, Ray, color_input, corners_of, interaction, share_input
 from .tables import World, rows_of
@@ -37,6 +38,8 @@ _BRIGHTEST = 1e30
 """Radiance that anything has at most, so that sums stay numbers."""
 _FAINT = 1e-4
 """Part of all the power of what glows below which an object lights nothing."""
+_LEVELS_SEEN = 7
+"""Of a tree, from the top, whose nodes have tables of what they send in each direction."""
 _SHADES = 8.0
 """Steps of colour that are told apart where objects are put together."""
 _PLACES = ((1 / 3, 1 / 3), (0.6, 0.2), (0.2, 0.6), (0.2, 0.2))
@@ -285,7 +288,8 @@ def _tree(corner: F64, weight: F64, area: F64) -> GlowTree:
     nodes = 2 * count - 1
     tree = GlowTree(
         np.zeros((nodes, 4)), np.zeros((nodes, 3)), np.zeros(nodes), np.zeros(nodes), np.zeros(nodes, np.int32),
-        np.zeros(nodes, np.int32), np.full(nodes, -1, np.int32), _axes(corner, middle),
+        np.zeros(nodes, np.int32), np.full(nodes, -1, np.int32), _axes(corner, middle), np.full(nodes, -1, np.int32),
+        np.zeros((0, 5), np.float32),
     )  # fmt: skip
     filled = np.zeros((count, 9))  # weight times area; that times middle and normal; area
     power = weight * area
@@ -307,7 +311,34 @@ def _tree(corner: F64, weight: F64, area: F64) -> GlowTree:
         low, high = (low.reshape(-1, 2, 3).min(axis=1), high.reshape(-1, 2, 3).max(axis=1)) if level else (low, high)
     leaves = places[depth][: len(area)]
     tree.triangle[leaves] = np.arange(len(area))
-    return tree
+    return _with_views(tree, places, normal * power[:, None], middle)
+
+
+def _with_views(tree: GlowTree, places: list[NDArray[np.int64]], facing: F64, middle: F64) -> GlowTree:
+    """The tree with tables for its upper nodes that are not flat.
+
+    Args:
+        places: of the nodes of each level.
+        facing: shape (T, 3): normals of the triangles, times area and weight [m^2]; `middle`: where they are [m].
+    """
+    levels = places[:-1][:_LEVELS_SEEN]
+    if not levels:
+        return tree
+    whole, at = np.zeros((2, len(places[-1]), 3))
+    whole[: len(facing)], at[: len(facing)] = facing, middle
+    centre = tree.node[levels[-1], :3]
+    shape = len(centre), -1, 3
+    bodies = bodies_of(whole.reshape(shape), at.reshape(shape) - centre[:, None])
+    tables: list[F32] = []
+    for nodes in reversed(levels):
+        above = tree.node[nodes, :3]
+        if len(above) < len(centre):
+            bodies, centre = joined(bodies, centre - np.repeat(above, 2, axis=0)), above
+        flat = np.linalg.norm(tree.facing[nodes], axis=1) >= FLAT * tree.power[nodes]
+        bent = np.flatnonzero(~flat & (tree.power[nodes] > 0.0))
+        tree.table[nodes[bent]] = sum(map(len, tables)) + ROWS * np.arange(len(bent))
+        tables.append(tables_of(bodies[bent]))
+    return tree._replace(tables=np.concatenate(tables))
 
 
 def _axes(corner: F64, middle: F64) -> F64:
@@ -327,13 +358,15 @@ def _one(trees: list[GlowTree], starts: NDArray[np.int64]) -> GlowTree:
     if not trees:
         return no_glow()
     triangles = np.cumsum([0, *(len(tree.corner) for tree in trees)])[:-1]
+    tables = np.cumsum([0, *(len(tree.tables) for tree in trees)])[:-1]
     moved = [
         tree._replace(
             right=np.where(tree.right > 0, tree.right + start, 0).astype(np.int32),
             after=(tree.after + start).astype(np.int32),
             triangle=np.where(tree.triangle >= 0, tree.triangle + first, -1).astype(np.int32),
+            table=np.where(tree.table >= 0, tree.table + before, -1).astype(np.int32),
         )
-        for tree, start, first in zip(trees, starts, triangles, strict=True)
+        for tree, start, first, before in zip(trees, starts, triangles, tables, strict=True)
     ]
     columns: list[Any] = [np.concatenate(column) for column in zip(*moved, strict=True)]
     return GlowTree(*columns)

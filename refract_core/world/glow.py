@@ -1,10 +1,11 @@
 """Light of what glows: triangles that shine, in a tree whose nodes stand for all below them, and exact spheres.
 
 A row of the light table is one such tree (`LightTable.root`). What arrives of it, if nothing is in the way, is a sum
-over a cut through the tree: a node that is far away and nearly flat is a point, a triangle that is near is Lambert's
-polygon. Points for shadow rays are drawn down the tree by what each side brings (Estevez and Kulla, "Importance
-Sampling of Many Lights with Adaptive Tree Splitting", 2018), so that the share of rays that get through is
-the share of the light that arrives. `world.emitters` builds the trees.
+over a cut through the tree: a node that is far away and nearly flat is a point, one that is not flat has a table of
+what it sends in each direction (`world.glow_views`), a triangle that is near is Lambert's polygon. Points for shadow
+rays are drawn down the tree by what each side brings (Estevez and Kulla, "Importance Sampling of Many Lights with
+Adaptive Tree Splitting", 2018), so that the share of rays that get through is the share of the light that arrives.
+`world.emitters` builds the trees.
 """
 
 from __future__ import annotations
@@ -14,16 +15,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..kernels.arrays import F64_1D, F64_2D, F64_3D, I32_1D
+from ..kernels.arrays import F32_2D, F64_1D, F64_2D, F64_3D, I32_1D
 from ..kernels.compile import inlined
 from ..kernels.vec import Vec, add, along, dot, length, normalize, row, scale, sub
 from ..optics.lobes import ggx, smith_visibility
 from ..scene import Light
+from .glow_views import irradiance_from, shown, solid_angle_of
 from .polygon import corner, polygon_irradiance
 
 _FAR = 8.0
 """Radii of a node away from which on it is a point: then that is right to half a percent, nearly everywhere."""
-_FLAT = 0.985
+_FAR_OF_ROUND = 16.0
+"""The same for a node that is not flat."""
+FLAT = 0.985
 """Length of the mean of a node's normals from which on it is nearly flat."""
 _TILT = 0.3
 """Sine of the angle by which normals of a nearly flat node may differ from their mean, and a bit."""
@@ -55,6 +59,10 @@ class GlowTree(NamedTuple):
     """shape (M,): that a leaf is; -1 of an empty one"""
     corner: F64_3D
     """shape (T, 3, 3): middle of a triangle, and two axes, as `polygon.corner` has them [m]"""
+    table: I32_1D
+    """shape (M,): where a node's table begins; -1 of those that have none: flat ones, and small ones far down"""
+    tables: F32_2D
+    """shape (V, 5): tables, as `glow_views.tables_of` makes them"""
 
 
 class Glow(NamedTuple):
@@ -70,8 +78,9 @@ def no_glow() -> GlowTree:
     """Without any tree."""
     numbers, words = np.zeros(0), np.zeros(0, np.int32)
     return GlowTree(
-        np.zeros((0, 4)), np.zeros((0, 3)), numbers, numbers, words, words, words, np.zeros((0, 3, 3))
-    )
+        np.zeros((0, 4)), np.zeros((0, 3)), numbers, numbers, words, words, words, np.zeros((0, 3, 3)), words,
+        np.zeros((0, 5), np.float32),
+    )  # fmt: skip
 
 
 @inlined
@@ -100,7 +109,7 @@ def glow_irradiance(glow: GlowTree, root: int, p: Vec, n: Vec) -> float:
         flat = length(facing)
         toward = -dot(facing, to)
         d2 = dot(to, to)
-        if flat >= _FLAT * power:
+        if flat >= FLAT * power:
             if toward <= -flat * (radius + _TILT * math.sqrt(d2)):  # turned away
                 i = glow.after[i]
                 continue
@@ -110,6 +119,12 @@ def glow_irradiance(glow: GlowTree, root: int, p: Vec, n: Vec) -> float:
                 total += flat * _above(toward / (flat * d), bent) * height / (d2 * d)
                 i = glow.after[i]
                 continue
+        elif glow.table[i] >= 0 and d2 >= _FAR_OF_ROUND * _FAR_OF_ROUND * radius * radius and height >= radius:
+            d = math.sqrt(d2)
+            w = scale(to, -1.0 / d)
+            total += irradiance_from(shown(glow.tables, glow.table[i], w), w, d, height, n)
+            i = glow.after[i]
+            continue
         if glow.right[i] == 0:
             if toward > 0.0:
                 axes = glow.corner[glow.triangle[i]]
@@ -149,7 +164,7 @@ def glow_highlight(glow: GlowTree, root: int, p: Vec, n: Vec, wo: Vec, alpha: fl
                 total += _gleam_of_triangle(glow, i, p, n, wo, r, alpha)
             i = glow.after[i]
             continue
-        if flat >= _FLAT * power:
+        if flat >= FLAT * power:
             if toward <= -flat * (radius + _TILT * d):  # turned away
                 i = glow.after[i]
                 continue
@@ -157,6 +172,14 @@ def glow_highlight(glow: GlowTree, root: int, p: Vec, n: Vec, wo: Vec, alpha: fl
                 bent = math.sqrt(max(0.0, 1.5 * (1.0 - (flat / power) ** 2)))
                 solid = flat * _above(toward / (flat * d), bent) / d2
                 total += solid * _lobe(scale(to, 1.0 / d), n, wo, n_dot_v, alpha)
+                i = glow.after[i]
+                continue
+        elif glow.table[i] >= 0 and d2 >= _FAR_OF_ROUND * _FAR_OF_ROUND * radius * radius:
+            wi = scale(to, 1.0 / d)
+            if radius <= _smallness(wi, r, alpha) * d:
+                w = scale(wi, -1.0)
+                solid = solid_angle_of(shown(glow.tables, glow.table[i], w), w, d)
+                total += solid * _lobe(wi, n, wo, n_dot_v, alpha)
                 i = glow.after[i]
                 continue
         i += 1
@@ -233,13 +256,24 @@ def _worth(glow: GlowTree, i: int, p: Vec, n: Vec) -> float:
 
 
 @inlined
+def _is_even(glow: GlowTree, i: int, p: Vec, n: Vec) -> bool:
+    """All that is below a node brings the same per area, about: it is flat, far away and over the horizon."""
+    to, radius = sub(row(glow.node, i), p), glow.node[i, 3]
+    far = dot(to, to) >= _FAR * _FAR * radius * radius and dot(to, n) >= radius
+    return far and length(row(glow.facing, i)) >= FLAT * glow.power[i]
+
+
+@inlined
 def glow_target(glow: GlowTree, root: int, p: Vec, n: Vec, u1: float, u2: float) -> tuple[Vec, float]:
     """A point on what glows [m], drawn by what it brings to a surface at `p` with normal `n`, about; and what the point
     stands for: the solid angle that it makes of all [sr], per radiance that triangles of weight 1 have. `u1`, `u2`:
     0 .. 1."""
-    i, chance = root, 1.0
+    i, chance, even = root, 1.0, False
     while glow.right[i] != 0:
-        left, right = _worth(glow, i + 1, p, n), _worth(glow, glow.right[i], p, n)
+        even = even or _is_even(glow, i, p, n)
+        left = right = 0.0
+        if not even:
+            left, right = _worth(glow, i + 1, p, n), _worth(glow, glow.right[i], p, n)
         if left + right <= 0.0:
             left, right = glow.power[i + 1], glow.power[glow.right[i]]
         share = left / (left + right)
