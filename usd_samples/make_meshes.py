@@ -104,6 +104,7 @@ LATHED: dict[str, tuple[str, list[tuple[float, float]]]] = {
 def main() -> None:
     """Write every mesh."""
     _write("gem", "A brilliant cut, 1.24 m wide.", *gem())
+    _write("drop", "A cut drop of crystal, 2 wide and 5 tall.", *drop())
     _write("ring", "A torus around y, 1.18 m wide.", *ring())
     _write("vase", "An open surface of revolution, 1.05 m tall.", *vase())
     for name, (doc, profile) in LATHED.items():
@@ -148,6 +149,12 @@ def gem(size: float = 0.62) -> tuple[F64, list[list[int]], None]:
         (1, 0.0, 0.0, -0.86),
     ]
     return _hull(size * np.vstack([_circle(n, radius, height, turn) for n, turn, radius, height in levels]))
+
+
+def drop() -> tuple[F64, list[list[int]], None]:
+    """Hull of two points and of three circles of eight, each turned against the next."""
+    circles = [_circle(8, 0.55, 1.2), _circle(8, 1.0, -1.4, 0.5), _circle(8, 0.85, -2.1)]
+    return _hull(np.concatenate([[(0.0, 2.0, 0.0), (0.0, -3.0, 0.0)], *circles]))
 
 
 def blossom(petals: int, wide: float, far: float, tall: float, cup: float) -> tuple[F64, list[list[int]]]:
