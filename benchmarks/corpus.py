@@ -2,8 +2,8 @@
 
     python -m benchmarks.corpus FOLDER OUT [--width 320] [--seconds 180] [--jobs 1] [--keep]
 
-Stages are .usd, .usda, .usdc, .usdz, .mtlx (on preview balls) and, with the gltf extra, .glb and .gltf (converted).
-Each is drawn by a process of its own, so that a crash is a row like any other. OUT gets:
+Stages are .usd, .usda, .usdc, .usdz, .mtlx (on preview balls) and, with the gltf extra, .glb and .gltf. Each is
+drawn by a process of its own, so that a crash is a row like any other. OUT gets:
 
     index.md, corpus.json     a line a stage: seconds, triangles, notices, causes; the table of causes
     sheet-NN.jpg              what we draw, with somebody else's picture beside it where one lies beside the stage
@@ -21,7 +21,6 @@ import json
 import re
 import subprocess
 import sys
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -151,24 +150,18 @@ def draw(stage: str, out: str, width: int) -> dict[str, Any]:
     from refract_core.settings import QUALITIES, RenderSettings
     from refract_core.usd.settings import read_settings
     from refract_core.usd.stage import open_stage, scene_from_stage
+    from refract_core.verbs.gltf import as_usd
 
     started = time.perf_counter()
     notices: list[Notice] = []
-    with tempfile.TemporaryDirectory() as folder:
-        if stage.lower().endswith((".glb", ".gltf")):
-            from refract_core.verbs.convert import ConvertOrder, convert
-
-            flat = f"{folder}/stage.usdc"
-            notices += convert(ConvertOrder(stage=stage, out=flat, flatten=True)).notices
-            stage = flat
-        opened = open_stage(stage)
-        authored = read_settings(opened, "", notices)
-        small = {"image_width": width, "image_height": 0, "jobs": 1}
-        settings = RenderSettings(**{**authored, **QUALITIES["good"], **small})
-        how: dict[str, Any] = {"purposes": settings.purposes, "camera": settings.camera}
-        scene = scene_from_stage(opened, **how)
-        read = time.perf_counter()
-        frame = render(scene, settings, scene_at=lambda code: scene_from_stage(opened, time_code=code, **how))
+    opened = open_stage(as_usd(stage, lambda path, text: notices.append(Notice(path, text))))
+    authored = read_settings(opened, "", notices)
+    small = {"image_width": width, "image_height": 0, "jobs": 1}
+    settings = RenderSettings(**{**authored, **QUALITIES["good"], **small})
+    how: dict[str, Any] = {"purposes": settings.purposes, "camera": settings.camera}
+    scene = scene_from_stage(opened, **how)
+    read = time.perf_counter()
+    frame = render(scene, settings, scene_at=lambda code: scene_from_stage(opened, time_code=code, **how))
     frame.save(out)
     notices += [*scene.notices, *frame.notices]
     return {
