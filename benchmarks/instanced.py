@@ -94,7 +94,7 @@ def measure(path: str, picture: str) -> None:
     from refract_core.world.instances import settled
     from refract_core.world.tables import pack_geometry
 
-    settings = rc.RenderSettings(image_width=480, image_height=360, samples=4)
+    settings = rc.RenderSettings(image_width=480, image_height=360, samples=4, studio="none")
 
     since = now()
     scene = load_stage(path)

@@ -16,6 +16,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from statistics import median
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +24,8 @@ from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
 from .instanced import Mark, marks_of, told
 from .room import globe
+
+STEPS = ("usd", "scene", "tables", "embree")
 
 
 class Loaded(NamedTuple):
@@ -32,7 +35,7 @@ class Loaded(NamedTuple):
     triangles: int
     """of all"""
     steps: dict[str, Mark]
-    """usd, scene, tables, embree"""
+    """usd: what USD alone takes; scene: all of `load_stage`, USD among it; tables; embree"""
     grown: dict[str, float]
     """step -> memory held after it [bytes for each triangle]; peak -> at the peak of all"""
 
@@ -108,20 +111,24 @@ def measure(path: str) -> None:
     del kept
 
 
-def loaded(meshes: int, triangles: int, *, bare: bool = False) -> Loaded:
-    """Make the stage and load it."""
+def loaded(meshes: int, triangles: int, *, bare: bool = False, repeat: int = 1) -> Loaded:
+    """Make the stage and load it; medians of `repeat` processes."""
     found: list[tuple[int, dict[str, Mark]]] = []
     with tempfile.TemporaryDirectory() as folder:
         for count in (max(1, meshes // 10), meshes):
             stage = Path(folder) / f"{count}.usdc"
             each = make(stage, count, triangles, bare=bare)
             command = [sys.executable, "-m", "benchmarks.loading", "--stage", str(stage)]
-            done = subprocess.run(command, capture_output=True, text=True, check=True)
-            found.append((each * count, marks_of(done.stdout)))
+            runs = [
+                marks_of(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+                for _ in range(repeat)
+            ]
+            middle = {name: Mark(*map(median, zip(*(run[name] for run in runs), strict=True))) for name in runs[0]}
+            found.append((each * count, middle))
     (few, less), (many, more) = found
     grown = {name: (more[name].held - less[name].held) / (many - few) for name in ("scene", "embree")}
     grown["peak"] = (more["embree"].peak - less["embree"].peak) / (many - few)
-    return Loaded(meshes, many, {name: mark for name, mark in more.items() if name != "start"}, grown)
+    return Loaded(meshes, many, {name: more[name] for name in STEPS}, grown)
 
 
 def main() -> None:
