@@ -163,6 +163,11 @@ class RenderSettings:
         """The picture is taken by a camera of its own."""
         return any(getattr(self, name) != value for name, value in NO_ORBIT.items())
 
+    @property
+    def longer_side(self) -> int:
+        """Of the whole picture, as it is asked for [pixels]; where no height is, a camera that is taller makes more."""
+        return max(self.image_width, self.image_height)
+
     def __post_init__(self) -> None:
         _check_orbit(self)
         _check_part(self)

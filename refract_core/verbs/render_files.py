@@ -438,7 +438,7 @@ def _how(shot: _Shot) -> dict[str, Any]:
     """What of a stage to read for a shot."""
     chosen = {"purposes": shot.settings.purposes, "camera": shot.settings.camera, "complexity": shot.complexity}
     own = {"orbits": True} if shot.settings.orbits else {}
-    return {"time_code": shot.time_code, **chosen, **own}
+    return {"time_code": shot.time_code, "pixels": shot.settings.longer_side, **chosen, **own}
 
 
 def _render_elsewhere(
@@ -513,8 +513,12 @@ def _stale(read: Callable[..., Scene], scene: Scene, shot: _Shot) -> list[Notice
     as coarse as they were then."""
     if not any(probe.bake for probe in scene.probes):
         return []
+    from ..usd.geometry.cages import USUAL_PIXELS
+
+    usual = shot.complexity == COMPLEXITIES[0] and shot.settings.longer_side <= USUAL_PIXELS
+
     def scene_at(time_code: float) -> Scene:
-        as_baked = shot.settings.purposes == RenderSettings().purposes and shot.complexity == COMPLEXITIES[0]
+        as_baked = shot.settings.purposes == RenderSettings().purposes and usual
         if time_code == scene.time_code and as_baked:
             return scene
         return read(time_code=time_code)
