@@ -148,7 +148,7 @@ def marks_of(lines: str) -> dict[str, Mark]:
 class Many(NamedTuple):
     """A stage of one mesh in very many places, and how it was loaded and drawn."""
 
-    count: int
+    places: int
     triangles: int
     """of the mesh"""
     steps: dict[str, Mark]

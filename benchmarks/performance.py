@@ -185,7 +185,7 @@ def places_table(found: instanced.Many) -> str:
          grown.get(name, "")]
         for name, mark in found.steps.items()
     ]  # fmt: skip
-    head = [f"{found.count:,} places of {found.triangles} triangles", "seconds", "held", "peak", "bytes a place"]
+    head = [f"{found.places:,} places of {found.triangles} triangles", "seconds", "held", "peak", "bytes a place"]
     return pages.table(head, rows)
 
 

@@ -43,8 +43,9 @@ def verb(orders: BinaryIO) -> tasks.Verb:
             if held is None or held[0] != key:
                 if held is not None:
                     reading.begins(limits["stage_seconds"])
-                how = {"purposes": wanted.purposes, "camera": wanted.camera, "pixels": wanted.longer_side}
-                scene = scene_from_stage(opened, time_code=key[0], **how)
+                scene = scene_from_stage(
+                    opened, time_code=key[0], purposes=wanted.purposes, camera=wanted.camera, pixels=wanted.longer_side
+                )
                 reading.has_ended()
                 tasks.check_scene(scene, limits)
                 held = key, scene

@@ -817,6 +817,13 @@ def test_many_surfaces_are_coarser_together() -> None:
     assert any("4,000,000 of all" in notice.text for notice in scene.notices)
 
 
+def test_what_large_pictures_ask_for_is_given_up_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("refract_core.usd.geometry.parts.MOST_IN_ALL", 10_000)
+    scene = read("".join(MESH(*solid("cube"), name=f"M{i}") for i in range(2)), pixels=4096)
+    assert [len(mesh.triangles) for mesh in scene.meshes] == [3072, 3072]
+    assert not any("of all" in notice.text for notice in scene.notices)
+
+
 def test_points_that_move_are_subdivided_where_they_are() -> None:
     points, faces = solid("cube")
     moved = [(x, y, z + 5) for x, y, z in points]
