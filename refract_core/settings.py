@@ -34,6 +34,8 @@ STUDIOS = ("softbox", "daylight", "dark", "none")
 PURPOSES = ("default", "render", "proxy", "guide")
 _COLOR = re.compile("#[0-9a-fA-F]{6}")
 MAX_PIXELS = 1 << 28
+USUAL_PIXELS = 1024
+"""Longer side of a picture up to which surfaces are as fine as without one, and complexity alone says how fine."""
 MAX_PHOTONS = 1 << 24
 
 

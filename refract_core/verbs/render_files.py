@@ -17,7 +17,7 @@ from ..images.exr import USUAL, Layout
 from ..probes.digest import stale_bakes
 from ..progress import Report
 from ..scene import Notice, Scene
-from ..settings import AS_IT_IS, NO_ORBIT, Opening, RenderSettings, named_settings
+from ..settings import AS_IT_IS, NO_ORBIT, USUAL_PIXELS, Opening, RenderSettings, named_settings
 from .executors import Bench, Crew, file_bytes, patience, sent_stage, spread
 from .looks import Looks, check_unfinished
 from .orders import peak_memory, stop_if
@@ -513,8 +513,6 @@ def _stale(read: Callable[..., Scene], scene: Scene, shot: _Shot) -> list[Notice
     as coarse as they were then."""
     if not any(probe.bake for probe in scene.probes):
         return []
-    from ..usd.geometry.cages import USUAL_PIXELS
-
     usual = shot.complexity == COMPLEXITIES[0] and shot.settings.longer_side <= USUAL_PIXELS
 
     def scene_at(time_code: float) -> Scene:

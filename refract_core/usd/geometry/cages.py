@@ -9,6 +9,7 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from ...scene import F32, F64, Notice
+from ...settings import USUAL_PIXELS
 from .refined import MOST_TRIANGLES, Cage, Edges, Fineness, steps_for, triangles_after
 from .subdivision import Scheme
 from .triangulate import Index, triangulate
@@ -23,9 +24,6 @@ FINENESS = {
     "high": Fineness(4, 1 << 19, 1 << 15), "veryhigh": Fineness(5, MOST_TRIANGLES, 1 << 17),
 }  # fmt: skip
 """By complexity. A dense cage is smooth as it is: where it has many faces, fewer steps will do."""
-
-USUAL_PIXELS = 1024
-"""Longer side of a picture up to which complexity alone says how fine surfaces are."""
 
 
 def fineness_for(complexity: str, pixels: int) -> Fineness:
