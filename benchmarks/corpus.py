@@ -1,9 +1,9 @@
 """Every stage below a folder: what we draw of it, how long that takes, and why it is not right where it is not.
 
-    python -m benchmarks.corpus FOLDER OUT [--width 320] [--seconds 180] [--jobs 1] [--keep]
+    python -m benchmarks.corpus FOLDER OUT [--width 320] [--seconds 180] [--jobs 1] [--keep] [--write]
 
-Stages are .usd, .usda, .usdc, .usdz, .mtlx (on preview balls) and, with the gltf extra, .glb and .gltf (converted).
-Each is drawn by a process of its own, so that a crash is a row like any other. OUT gets:
+Stages are .usd, .usda, .usdc, .usdz, .mtlx (on preview balls) and, with the gltf extra, .glb and .gltf. Each is
+drawn by a process of its own, so that a crash is a row like any other. OUT gets:
 
     index.md, corpus.json     a line a stage: seconds, triangles, notices, causes; the table of causes
     sheet-NN.jpg              what we draw, with somebody else's picture beside it where one lies beside the stage
@@ -11,7 +11,7 @@ Each is drawn by a process of its own, so that a crash is a row like any other. 
 
 A cause is a reason why a picture may differ from what usdview shows, by what the reader itself said (`CAUSES`), or by
 what came of it: a crash, too long, nothing seen. What nobody said has no cause here; the sheets are there to be
-looked at.
+looked at. `--write` puts the numbers into docs/corpus.md.
 """
 
 from __future__ import annotations
@@ -21,18 +21,21 @@ import json
 import re
 import subprocess
 import sys
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from statistics import median
 from typing import Any, NamedTuple
 
 from PIL import Image, ImageDraw
 
+from . import pages
+
 USD = (".usd", ".usda", ".usdc", ".usdz")
 OTHER = (".mtlx", ".glb", ".gltf")
+PAGE = pages.ROOT / "docs" / "corpus.md"
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
 BESIDE = ("baseline", "baselines", "ref", "reference", "screenshot", "screenshots", "media", "thumbnails", "preview")
 """Folders, and beginnings of file names, of pictures that show what a stage should look like."""
@@ -84,6 +87,11 @@ CAUSES = (
     Cause(_UNSEEN, r"^no pixel of the picture shows anything"),
     Cause("render settings", r"is authored but not used|renderSettingsPrimPath|RenderProduct|RenderVar"),
 )
+FAULTS = {
+    "missing file", _REFUSED, "texture", "value out of range", "bad geometry", "bad metadata", "subset", "instances",
+    _UNSEEN,
+}  # fmt: skip
+"""Said of what makes no sense as it stands, or is not there."""
 NO_MISTAKE = {
     "no camera", "no light", "empty", "binding without its schema", "draw mode", "depth of field", "motion blur",
     "exposure",
@@ -151,24 +159,18 @@ def draw(stage: str, out: str, width: int) -> dict[str, Any]:
     from refract_core.settings import QUALITIES, RenderSettings
     from refract_core.usd.settings import read_settings
     from refract_core.usd.stage import open_stage, scene_from_stage
+    from refract_core.verbs.gltf import as_usd
 
     started = time.perf_counter()
     notices: list[Notice] = []
-    with tempfile.TemporaryDirectory() as folder:
-        if stage.lower().endswith((".glb", ".gltf")):
-            from refract_core.verbs.convert import ConvertOrder, convert
-
-            flat = f"{folder}/stage.usdc"
-            notices += convert(ConvertOrder(stage=stage, out=flat, flatten=True)).notices
-            stage = flat
-        opened = open_stage(stage)
-        authored = read_settings(opened, "", notices)
-        small = {"image_width": width, "image_height": 0, "jobs": 1}
-        settings = RenderSettings(**{**authored, **QUALITIES["good"], **small})
-        how: dict[str, Any] = {"purposes": settings.purposes, "camera": settings.camera}
-        scene = scene_from_stage(opened, **how)
-        read = time.perf_counter()
-        frame = render(scene, settings, scene_at=lambda code: scene_from_stage(opened, time_code=code, **how))
+    opened = open_stage(as_usd(stage, lambda path, text: notices.append(Notice(path, text))))
+    authored = read_settings(opened, "", notices)
+    small = {"image_width": width, "image_height": 0, "jobs": 1}
+    settings = RenderSettings(**{**authored, **QUALITIES["good"], **small})
+    how: dict[str, Any] = {"purposes": settings.purposes, "camera": settings.camera}
+    scene = scene_from_stage(opened, **how)
+    read = time.perf_counter()
+    frame = render(scene, settings, scene_at=lambda code: scene_from_stage(opened, time_code=code, **how))
     frame.save(out)
     notices += [*scene.notices, *frame.notices]
     return {
@@ -263,6 +265,32 @@ def page(folder: str, rows: Sequence[dict[str, Any]], names: Sequence[str]) -> s
     return "\n".join(lines) + "\n"
 
 
+def summary(rows: Sequence[dict[str, Any]], width: int) -> str:
+    """What docs/corpus.md says of a run."""
+    ends = Counter(cause for row in rows for cause in row["causes"] if cause in (_CRASH, _LATE, _REFUSED))
+    told = ", ".join(f"{ends[name]} {name}" for name in (_CRASH, _LATE, _REFUSED))
+    seconds = sorted(row["seconds"] for row in rows)
+    first = (
+        f"{len(rows)} stages, {width} pixels wide, a process each on one of {pages.machine()}: {median(seconds)} s in "
+        f"the middle and {seconds[-1]} s at most. {told}."
+    )
+    of: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        of.setdefault(row["stage"].partition("/")[0], []).append(row)
+    folders = [
+        [f"`{name}`", str(len(some)), str(sum(bool(row["beside"]) for row in some)),
+         str(sum(not set(row["causes"]) - NO_MISTAKE for row in some))]
+        for name, some in of.items()
+    ]  # fmt: skip
+    kinds = ((NO_MISTAKE, "lacking, or asked for: drawn, and said"), (FAULTS, "a fault of the stage: said"))
+    causes = [
+        [name, next((kind for names, kind in kinds if name in names), "not drawn as it is meant: said"), str(count)]
+        for name, count in table_of_causes(rows) if name != "none"
+    ]  # fmt: skip
+    by_folder = pages.table(["folder", "stages", "with a picture beside", "nothing but what is lacking"], folders)
+    return f"{first}\n\n{by_folder}\n\n{pages.table(['cause', 'what it is', 'stages'], causes)}"
+
+
 def run(folder: Path, out: Path, *, width: int, seconds: float, jobs: int, keep: bool) -> list[dict[str, Any]]:
     """Draw everything, and write the pages. `keep`: rows of an earlier run that have a picture are not drawn again."""
     (out / "pictures").mkdir(parents=True, exist_ok=True)
@@ -297,6 +325,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--seconds", type=float, default=180.0, help="after which a stage is given up")
     parser.add_argument("--jobs", type=int, default=1, choices=(1, 2), help="stages at once")
     parser.add_argument("--keep", action="store_true", help="do not draw again what an earlier run has drawn")
+    parser.add_argument("--write", action="store_true", help=f"the numbers into {PAGE.relative_to(pages.ROOT)}")
     parser.add_argument("--stage", action="store_true", help="FOLDER is one stage and OUT its picture")
     asked = parser.parse_args(words)
     if asked.stage:
@@ -310,6 +339,8 @@ def main(words: Sequence[str] | None = None) -> None:
     rows = run(asked.folder, asked.out, width=asked.width, seconds=asked.seconds, jobs=asked.jobs, keep=asked.keep)
     for name, count in table_of_causes(rows):
         print(f"{count:5d}  {name}")
+    if asked.write:
+        pages.write(PAGE, {"corpus": summary(rows, asked.width)})
 
 
 if __name__ == "__main__":

@@ -10,12 +10,14 @@ a difference of two.
 from __future__ import annotations
 
 import argparse
+import ctypes
 import math
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, Vt
@@ -92,16 +94,7 @@ def measure(path: str, picture: str) -> None:
     from refract_core.world.instances import settled
     from refract_core.world.tables import pack_geometry
 
-    settings = rc.RenderSettings(image_width=480, image_height=360, samples=4)
-
-    def now() -> tuple[float, float]:
-        return time.perf_counter(), time.process_time()
-
-    def told(what: str, since: tuple[float, float]) -> None:
-        passed, computed = (after - before for after, before in zip(now(), since, strict=True))
-        status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
-        held, peak = (int(status[name].split()[0]) / 1024 for name in ("VmRSS", "VmHWM"))
-        print(f"{what} {passed:.2f} {computed:.2f} {held:.0f} {peak:.0f}", flush=True)
+    settings = rc.RenderSettings(image_width=480, image_height=360, samples=4, studio="none")
 
     since = now()
     scene = load_stage(path)
@@ -118,25 +111,80 @@ def measure(path: str, picture: str) -> None:
             drawn.save(picture)
 
 
-def run(count: int, kind: str, around: int, picture: str) -> None:
-    """Print the table."""
+class Mark(NamedTuple):
+    """What a step of a process took, and its memory then."""
+
+    seconds: float
+    computed: float
+    """of CPU"""
+    held: float
+    """[bytes], after the allocator has given back what is free"""
+    peak: float
+    """[bytes], of all steps so far"""
+
+
+def now() -> tuple[float, float]:
+    """Seconds that have passed, and those that this process has computed."""
+    return time.perf_counter(), time.process_time()
+
+
+def told(what: str, since: tuple[float, float]) -> tuple[float, float]:
+    """Print the line of a step that began at `since`. Returns when the next one begins."""
+    passed, computed = (after - before for after, before in zip(now(), since, strict=True))
+    if sys.platform == "linux" and hasattr(lib := ctypes.CDLL(None), "malloc_trim"):
+        lib.malloc_trim(0)
+    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    held, peak = (int(status[name].split()[0]) * 1024 for name in ("VmRSS", "VmHWM"))
+    print(f"{what} {passed:.3f} {computed:.3f} {held} {peak}", flush=True)
+    return now()
+
+
+def marks_of(lines: str) -> dict[str, Mark]:
+    """What a process has printed by `told`."""
+    rows = (line.split() for line in lines.splitlines())
+    return {name: Mark(*map(float, numbers)) for name, *numbers in rows}
+
+
+class Many(NamedTuple):
+    """A stage of one mesh in very many places, and how it was loaded and drawn."""
+
+    places: int
+    triangles: int
+    """of the mesh"""
+    steps: dict[str, Mark]
+    """load, tables, first, second"""
+    grown: dict[str, float]
+    """load: at its peak; tables: held; second: at the peak of all [bytes for each place]"""
+
+
+def measured(count: int, kind: str, around: int, picture: str = "") -> Many:
+    """Make the stage, load it and draw it."""
     with tempfile.TemporaryDirectory() as folder:
-        found: dict[int, dict[str, list[float]]] = {}
+        found: dict[int, dict[str, Mark]] = {}
         for places in (max(10, count // 10), count):
             stage = Path(folder) / f"{places}.usdc"
             triangles = make(stage, places, kind, around)
             command = [sys.executable, "-m", "benchmarks.instanced", str(stage), picture if places == count else ""]
             done = subprocess.run(command, capture_output=True, text=True, check=True)
-            rows = (line.split() for line in done.stdout.splitlines())
-            found[places] = {name: [float(number) for number in numbers] for name, *numbers in rows}
-    few, many = found
-    print(f"{count} places of a {kind} of {triangles} triangles")
+            found[places] = marks_of(done.stdout)
+    (few, less), (many, more) = found.items()
+    grown = {
+        "load": more["load"].peak - less["load"].peak,
+        "tables": more["tables"].held - less["tables"].held,
+        "second": more["second"].peak - less["second"].peak,
+    }
+    return Many(count, triangles, more, {name: size / (many - few) for name, size in grown.items()})
+
+
+def run(count: int, kind: str, around: int, picture: str) -> None:
+    """Print the table."""
+    found = measured(count, kind, around, picture)
+    print(f"{count} places of a {kind} of {found.triangles} triangles")
     print(f"{'':<8} {'seconds':>8} {'of CPU':>8} {'MiB held':>9} {'MiB peak':>9}")
-    for name, (passed, computed, held, peak) in found[many].items():
-        print(f"{name:<8} {passed:8.2f} {computed:8.2f} {held:9.0f} {peak:9.0f}")
-    for step, what, column in (("load", "at its peak", 3), ("tables", "held", 2), ("second", "at the peak", 3)):
-        grown = (found[many][step][column] - found[few][step][column]) * 2**20 / (many - few)
-        print(f"{step:<8} {grown:8.0f} bytes {what} for each place")
+    for name, mark in found.steps.items():
+        print(f"{name:<8} {mark.seconds:8.2f} {mark.computed:8.2f} {mark.held / 2**20:9.0f} {mark.peak / 2**20:9.0f}")
+    for step, what in (("load", "at its peak"), ("tables", "held"), ("second", "at the peak")):
+        print(f"{step:<8} {found.grown[step]:8.0f} bytes {what} for each place")
 
 
 def main() -> None:

@@ -1,7 +1,8 @@
-"""What docs/performance.md says, measured again: a frame, a cold start, lights, threads, and a path tracer beside it.
+"""What docs/performance.md says, measured again: a frame, a cold start, loading, lights, threads, and a path
+tracer beside it.
 
-    python -m benchmarks.performance [--parts frame,cold,lights,threads,peers] [--width 1280] [--repeat 5] [--jobs 0]
-                                     [--cache FOLDER] [--peers-size 640] [--reference-samples 4096]
+    python -m benchmarks.performance [--parts frame,cold,loading,lights,threads,peers] [--width 1280] [--repeat 5]
+                                     [--jobs 0] [--cache FOLDER] [--peers-size 640] [--reference-samples 4096]
                                      [--mitsuba 1,4,16,64] [--write]
 
 `--write` puts each part that was measured into its place in the page, and its short form into README; the other parts
@@ -9,6 +10,7 @@ stay as they are. Give it a quiet machine.
 
     frame       `benchmarks.frame`: warm frames against bare Embree of their own number of rays
     cold        fresh processes, from their start to the written picture
+    loading     `benchmarks.loading`, and a million places of one mesh by `benchmarks.instanced`
     lights      the lit room of `benchmarks.two_rooms`, its lamp cut into smaller ones that shine alike, by turns
     threads     one thread and all of them, by turns
     peers       `benchmarks.peers`; needs the extra `bench`, and takes minutes the first time, for the truth
@@ -32,7 +34,7 @@ from refract_core.errors import UsageError
 from refract_core.kernels import ahead
 from refract_core.scene import Light, Scene
 
-from . import pages, peers
+from . import instanced, loading, pages, peers
 from .frame import Warm, cold_seconds, warm
 from .in_refract import scene_of
 from .two_rooms import ROOMS
@@ -50,6 +52,8 @@ CUTS = (1, 4, 8)
 """Lamps along a side of the one that is cut"""
 WIDTHS = (320, 1280)
 """Of the pictures that a cold process draws [pixels]"""
+PLACES = 1_000_000
+"""Of one mesh"""
 
 
 class Options(NamedTuple):
@@ -145,6 +149,44 @@ def cold_sentence(found: Mapping[int, tuple[float, ...]]) -> str:
     """README's."""
     told = " and ".join(f"{seconds[0]:.1f} s at {width} pixels" for width, seconds in found.items())
     return f"A fresh process draws `marble.usda` at the default quality in {told}, from its start to the PNG."
+
+
+# ------------------------------------------------------------------------------------------------ loading
+
+
+def load(options: Options) -> Part:
+    """Many meshes, with normals and texture coordinates and bare; few large ones; and one mesh in a million places."""
+    sizes = {"": (1000, 1000, False), ", points alone": (1000, 1000, True), ", large": (10, 100_000, False)}
+    found = {
+        f"{meshes:,} meshes{name}": loading.loaded(meshes, triangles, bare=bare, repeat=options.repeat)
+        for name, (meshes, triangles, bare) in sizes.items()
+    }
+    return Part(f"{loading_table(found)}\n\n{places_table(instanced.measured(PLACES, 'leaf', 32))}")
+
+
+def loading_table(found: Mapping[str, loading.Loaded]) -> str:
+    """Markdown: what it is -> how it was loaded."""
+    head = ["stage", "triangles", "USD alone", "a scene, with USD's part", "tables", "Embree", "bytes a triangle",
+            "at the peak"]  # fmt: skip
+    rows = [
+        [name, f"{one.triangles:,}", *(f"{one.steps[step].seconds:.2f} s" for step in loading.STEPS),
+         f"{one.grown['embree']:.0f}", f"{one.grown['peak']:.0f}"]
+        for name, one in found.items()
+    ]  # fmt: skip
+    return pages.table(head, rows)
+
+
+def places_table(found: instanced.Many) -> str:
+    """Markdown: its steps, with what each place costs."""
+    told = {"load": "load", "tables": "tables and Embree", "first": "first picture", "second": "second picture"}
+    grown = {name: f"{size:.0f}" for name, size in found.grown.items()}
+    rows = [
+        [told[name], f"{mark.seconds:.2f} s", f"{mark.held / 2**20:.0f} MiB", f"{mark.peak / 2**20:.0f} MiB",
+         grown.get(name, "")]
+        for name, mark in found.steps.items()
+    ]  # fmt: skip
+    head = [f"{found.places:,} places of {found.triangles} triangles", "seconds", "held", "peak", "bytes a place"]
+    return pages.table(head, rows)
 
 
 # ------------------------------------------------------------------------------------------------ many lights
@@ -253,6 +295,7 @@ def peers_table(found: Mapping[str, Iterable[peers.Run]]) -> str:
 PARTS: dict[str, Callable[[Options], Part]] = {
     "frame": frame,
     "cold": cold,
+    "loading": load,
     "lights": lights,
     "threads": threads,
     "peers": beside,
@@ -264,7 +307,7 @@ def made(name: str, options: Options) -> str:
     """One line on how a part was measured."""
     rooms = options.rooms
     size = rooms.size if name == "peers" else options.width
-    wide = "" if name == "cold" else f", {size} pixels wide"
+    wide = "" if name in ("cold", "loading") else f", {size} pixels wide"
     turns = rooms.repeat if name == "peers" else options.repeat
     return f"`python -m benchmarks.performance --parts {name}` on {pages.machine()}{wide}, medians of {turns}:"
 

@@ -34,6 +34,8 @@ STUDIOS = ("softbox", "daylight", "dark", "none")
 PURPOSES = ("default", "render", "proxy", "guide")
 _COLOR = re.compile("#[0-9a-fA-F]{6}")
 MAX_PIXELS = 1 << 28
+USUAL_PIXELS = 1024
+"""Longer side of a picture up to which surfaces are as fine as without one, and complexity alone says how fine."""
 MAX_PHOTONS = 1 << 24
 
 
@@ -162,6 +164,11 @@ class RenderSettings:
     def orbits(self) -> bool:
         """The picture is taken by a camera of its own."""
         return any(getattr(self, name) != value for name, value in NO_ORBIT.items())
+
+    @property
+    def longer_side(self) -> int:
+        """Of the whole picture, as it is asked for [pixels]; where no height is, a camera that is taller makes more."""
+        return max(self.image_width, self.image_height)
 
     def __post_init__(self) -> None:
         _check_orbit(self)

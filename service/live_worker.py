@@ -39,11 +39,13 @@ def verb(orders: BinaryIO) -> tasks.Verb:
         for line in iter(orders.readline, b""):
             order = json.loads(line)
             wanted = chosen_settings(authored, {**tasks.asked_of(order), "jobs": settings["threads"]})
-            key = order.get("time_code"), wanted.purposes, wanted.camera
+            key = order.get("time_code"), wanted.purposes, wanted.camera, wanted.longer_side
             if held is None or held[0] != key:
                 if held is not None:
                     reading.begins(limits["stage_seconds"])
-                scene = scene_from_stage(opened, time_code=key[0], purposes=wanted.purposes, camera=wanted.camera)
+                scene = scene_from_stage(
+                    opened, time_code=key[0], purposes=wanted.purposes, camera=wanted.camera, pixels=wanted.longer_side
+                )
                 reading.has_ended()
                 tasks.check_scene(scene, limits)
                 held = key, scene

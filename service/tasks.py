@@ -197,7 +197,10 @@ def _render(stage: str, out: str, settings: Mapping[str, Any], limits: Mapping[s
     session = Session() if count > 1 else None
     done: list[dict[str, Any]] = []
     for time_code in times:
-        chosen: dict[str, Any] = {"purposes": wanted.purposes, "camera": wanted.camera, "orbits": wanted.orbits}
+        chosen: dict[str, Any] = {
+            "purposes": wanted.purposes, "camera": wanted.camera, "orbits": wanted.orbits,
+            "pixels": max(side for size in sizes for side in size),
+        }  # fmt: skip
         scene = scene_from_stage(opened, time_code=time_code, **chosen)
         reading.has_ended()
         check_scene(scene, limits)

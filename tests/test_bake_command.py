@@ -7,10 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from bake_studio import LEFT, RIGHT, Studio, probe_of, studio_in
 from typer.testing import CliRunner
 
+import refract_core as rc
 from refract_core.cli import app
 from refract_core.errors import Cancelled, ImageError, StageError
 from refract_core.images.cubemaps import read_notes
@@ -85,6 +87,36 @@ def test_each_time_code_is_read_once(studio: Studio) -> None:
     ]
     assert [notice.path for notice in stale_bakes(probes, scene_at)] == [LEFT]
     assert asked == [7.0, 9.0]
+
+
+SMOOTH = """def Mesh "Smooth" {
+        int[] faceVertexCounts = [4, 4, 4, 4, 4, 4]
+        int[] faceVertexIndices = [1, 3, 7, 5, 2, 0, 4, 6, 3, 2, 6, 7, 0, 1, 5, 4, 4, 5, 7, 6, 2, 3, 1, 0]
+        point3f[] points = [(4, 0, 0), (5, 0, 0), (4, 1, 0), (5, 1, 0), (4, 0, 1), (5, 0, 1), (4, 1, 1), (5, 1, 1)]
+    }
+    """
+
+
+def test_a_large_picture_has_finer_surfaces_and_its_bakes_are_still_true(
+    studio: Studio, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    studio.stage.write_text(studio.stage.read_text().replace('def Cube "Box"', f'{SMOOTH}def Cube "Box"', 1))
+    studio.bake()
+    probe = probe_of(studio.out(), LEFT)
+    assert probe_digest(load_stage(studio.out()), probe) != probe_digest(load_stage(studio.out(), pixels=2048), probe)
+    planes = {"beauty": np.zeros((1, 1, 4), np.float32)}
+    drawn: list[int] = []
+
+    def render(scene: Scene, *_: Any, **__: Any) -> rc.Frame:
+        drawn.append(max(len(mesh.triangles) for mesh in scene.meshes))
+        return rc.Frame(1, 1, planes)
+
+    monkeypatch.setattr("refract_core.rendering.picture.render", render)
+    for width in (960, 2048):
+        ended = CliRunner().invoke(app, ["render", str(studio.out()), str(studio.folder / "a.png"), "-w", str(width)])
+        assert ended.exit_code == 0, ended.stderr
+        assert LEFT not in ended.stderr
+    assert drawn == [3072, 4 * 3072]
 
 
 # --- the command

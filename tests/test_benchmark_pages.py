@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import refract_core as rc
-from benchmarks import accuracy, pages, peers, performance
+from benchmarks import accuracy, instanced, loading, pages, peers, performance
 from benchmarks.frame import Warm
 from refract_core.errors import RefractError
 from refract_core.scene import Light, LightKind
@@ -162,6 +162,18 @@ def test_tables_of_performance() -> None:
     assert "when the package was built" in performance.cold_table(cold, "")
     assert "by numba" in performance.cold_table(cold, "it is a checkout")
     assert "1.0 s at 320 pixels and 2.0 s at 1280 pixels" in performance.cold_sentence(cold)
+    marks = {name: instanced.Mark(0.5, 0.4, 2**20, 2**21) for name in (*loading.STEPS, "load")}
+    steps = loading.Loaded(1, 900_000, marks, {"scene": 60.0, "embree": 180.0, "peak": 190.0})
+    assert "| 900,000 | 0.50 s | 0.50 s | 0.50 s | 0.50 s | 180 | 190 |" in performance.loading_table({"one": steps})
+    many = instanced.Many(1000, 960, {"load": marks["load"]}, {"load": 273.0})
+    assert "| load | 0.50 s | 1 MiB | 2 MiB | 273 |" in performance.places_table(many)
+
+
+@pytest.mark.slow
+def test_a_small_stage_is_loaded_and_measured() -> None:
+    found = loading.loaded(10, 64)
+    assert found.triangles == 10 * 48
+    assert all(mark.held > 0.0 and mark.peak > 0.0 for mark in found.steps.values())
 
 
 def test_the_short_table_of_peers_has_a_column_for_each_room() -> None:

@@ -110,7 +110,7 @@ def test_without_flags_the_defaults_are_rendered(engine: Engine, tmp_path: Path)
     assert refract("render", "a.usda", tmp_path / "a.png").code == 0
     assert engine.settings == [rc.RenderSettings()]
     assert engine.stages == ["a.usda"]
-    plain = {"time_code": None, "purposes": ("default", "render"), "camera": "", "complexity": "low"}
+    plain = {"time_code": None, "purposes": ("default", "render"), "camera": "", "complexity": "low", "pixels": 960}
     assert engine.scenes == [plain]
     assert files(tmp_path) == ["a.png"]
 

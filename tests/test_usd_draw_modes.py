@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pxr import Usd, UsdGeom
 from scene_reading import read, texts, to_stage
 
+import refract_core as rc
 from refract_core.scene import Mesh, Scene
 from refract_core.usd.stage import load_stage
 
@@ -182,6 +183,31 @@ def test_one_picture_of_an_axis_is_seen_through_from_the_other_side(tmp_path: Pa
     for point, st in zip(front, st_front, strict=True):
         (same,) = np.nonzero(np.isclose(back[:, others], point[others], atol=1e-4).all(axis=1))
         np.testing.assert_allclose(st_back[same], np.broadcast_to(st, (len(same), 2)), atol=1e-4)
+
+
+@pytest.mark.parametrize("geometry", ["cross", "box"])
+@pytest.mark.parametrize("side", [1, -1])
+def test_who_stands_on_a_side_sees_its_picture(tmp_path: Path, geometry: str, side: int) -> None:
+    """And not that of the side behind, although both cards of a cross lie in one plane."""
+    oiio = pytest.importorskip("OpenImageIO")
+    for name, pixel in (("pos", (1.0, 0.0, 0.0)), ("neg", (0.0, 1.0, 0.0))):
+        file = oiio.ImageOutput.create("t.png")
+        assert file.open(str(tmp_path / f"{name}.png"), oiio.ImageSpec(2, 2, 3, "uint8"))
+        assert file.write_image(np.full((2, 2, 3), pixel, np.float32))
+        file.close()
+    said = CARDS + f'uniform token model:cardGeometry = "{geometry}"\n'
+    said += "asset model:cardTextureXPos = @pos.png@\nasset model:cardTextureXNeg = @neg.png@\n"
+    eye = f"""def Camera "Eye" {{ float2 clippingRange = (0.1, 100)
+        double3 xformOp:translate = ({9 * side}, 0, 0)
+        double3 xformOp:rotateXYZ = (0, {90 * side}, 0)
+        uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateXYZ"] }}\n"""
+    text = (model(said) + eye + 'def DomeLight "Sky" { }').replace("{", "{\n").replace("}", "\n}\n")
+    path = tmp_path / "s.usda"
+    path.write_text(f'#usda 1.0\n(\nupAxis = "Y"\nmetersPerUnit = 1\n)\n{text}')
+    drawn = rc.render(load_stage(str(path)), rc.RenderSettings(image_width=9, image_height=9, samples=1, jobs=1))
+    red, green = drawn.planes["beauty"][4, 4, :2]
+    assert (red > 4.0 * green) == (side > 0)
+    assert (green > 4.0 * red) == (side < 0)
 
 
 @pytest.mark.parametrize(("up", "left"), [("Z", 8), ("Y", 8)])

@@ -258,3 +258,14 @@ def test_arnold_images_are_followed(tmp_path: Path) -> None:
     assert source.scale[:3] == (0.5, 0.5, 0.5)
     assert source.uv_matrix[0] == 3.0
     assert source.wrap == (Wrap.REPEAT, Wrap.REPEAT)
+
+
+def test_a_normal_is_made_a_unit_vector_by_who_takes_it(tmp_path: Path) -> None:
+    """`normalize` of numbers is theirs; of a picture, as `normalmap` in object space becomes, it is the picture."""
+    graph = node("P", "image_vector3", "asset inputs:file = @./t.png@", kind="float3")
+    wired = graph + node("N", "normalize_vector3", wire("float3", "in", "P"), kind="float3")
+    found = read(tmp_path, wired, kind="float3", port="normal")
+    np.testing.assert_allclose(value(found, found[Param.NORMAL]), LEFT, atol=1e-6)
+    numbers = node("N", "normalize_vector3", "float3 inputs:in = (0, 3, 4)", kind="float3")
+    found = read(tmp_path, numbers, kind="float3")
+    np.testing.assert_allclose(value(found, found[Param.DIFFUSE]), (0.0, 0.6, 0.8), atol=1e-6)

@@ -750,6 +750,35 @@ def test_complexity_says_how_fine() -> None:
         read(text, complexity="extreme")
 
 
+EIGHT = [[a, b, c] for a in (0, 3) for b in (1, 4) for c in (2, 5)]
+OCTAHEDRON = (
+    [(1, 0, 0), (0, 1, 0), (0, 0, 1), (-1, 0, 0), (0, -1, 0), (0, 0, -1)],
+    [face[:: 1 if sum(i > 2 for i in face) % 2 == 0 else -1] for face in EIGHT],
+)
+
+
+@pytest.mark.parametrize(("cage", "scheme"), [(solid("cube"), "catmullClark"), (OCTAHEDRON, "loop")])
+@pytest.mark.parametrize("pixels", [1024, 1920, 4096, 7680])
+def test_outlines_are_round_in_large_pictures_too(cage: Any, scheme: str, pixels: int) -> None:
+    """A surface that fills nine sixteenths of the longer side has chords that leave it by a pixel at most."""
+    mesh = read(MESH(*cage, scheme=scheme), pixels=pixels).meshes[0]
+    assert mesh.normals is not None
+    ends = mesh.points[mesh.triangles].astype(np.float64)
+    along = np.roll(ends, -1, axis=1) - ends
+    bent = np.roll(mesh.normals, -1, axis=1).astype(np.float64) - mesh.normals
+    sagitta = np.abs(np.einsum("tki,tki->tk", along, bent)) / 8.0
+    pixel = np.ptp(mesh.points, axis=0).max() / (9.0 / 16.0 * pixels)
+    assert sagitta.max() < pixel
+
+
+def test_a_picture_of_a_usual_size_has_the_surface_of_none_in_particular() -> None:
+    """So what is read without a picture (probes, what they were baked from) is what is drawn."""
+    text = MESH(*solid("cube"))
+    usual, other, large = (read(text, pixels=pixels).meshes[0] for pixels in (0, 1024, 3840))
+    np.testing.assert_array_equal(usual.points, other.points)
+    assert len(large.triangles) == 4 * len(usual.triangles)
+
+
 def test_a_dense_cage_takes_fewer_steps_and_says_so() -> None:
     side = 200
     text = MESH(*grid(side)) + MESH(*solid("cube"), name="Small")
@@ -786,6 +815,13 @@ def test_many_surfaces_are_coarser_together() -> None:
     assert len(scene.meshes) == 200
     assert len(scene.meshes[0].triangles) < 2 * 128 * 128
     assert any("4,000,000 of all" in notice.text for notice in scene.notices)
+
+
+def test_what_large_pictures_ask_for_is_given_up_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("refract_core.usd.geometry.parts.MOST_IN_ALL", 10_000)
+    scene = read("".join(MESH(*solid("cube"), name=f"M{i}") for i in range(2)), pixels=4096)
+    assert [len(mesh.triangles) for mesh in scene.meshes] == [3072, 3072]
+    assert not any("of all" in notice.text for notice in scene.notices)
 
 
 def test_points_that_move_are_subdivided_where_they_are() -> None:

@@ -20,7 +20,7 @@ from ..settings import AS_IT_IS, Opening
 from ..world.solid import areas
 from .camera import choose_camera, read_cameras
 from .diagnostics import captured, opened, words_of
-from .geometry.cages import FINENESS
+from .geometry.cages import FINENESS, fineness_for
 from .geometry.curves import cuts_for
 from .geometry.dots import Dots, read_dots, spread_dots
 from .geometry.many import Bodies, Cloud, Group, bounds_of_cloud, bounds_of_group, shared, to_balls
@@ -116,6 +116,7 @@ def load_stage(
     purposes: tuple[str, ...] = ("default", "render"),
     camera: str = "",
     complexity: str = "low",
+    pixels: int = 0,
     opening: Opening = AS_IT_IS,
 ) -> Scene:
     """Reads a stage at one time, of any file but glTF, which `verbs.table.load_stage` reads as well.
@@ -127,6 +128,7 @@ def load_stage(
         purposes: which of default, render, proxy and guide are drawn
         camera: prim path or name of the camera that `Scene.cameras` begins with; '' chooses one
         complexity: how fine subdivision surfaces are: low, medium, high or veryhigh
+        pixels: longer side of the pictures that will be drawn; above 1024 surfaces of few faces are finer
         opening: session layer, variants and mask; of files, for an open stage is its owner's to change
 
     Raises:
@@ -134,7 +136,9 @@ def load_stage(
         UsageError: it has no such camera, there is no such complexity, the opening asks for what is not there, or
             `path` is none of the three.
     """
-    how: dict[str, Any] = {"time_code": time_code, "purposes": purposes, "camera": camera, "complexity": complexity}
+    how: dict[str, Any] = {
+        "time_code": time_code, "purposes": purposes, "camera": camera, "complexity": complexity, "pixels": pixels,
+    }  # fmt: skip
     if isinstance(path, str | os.PathLike):
         return scene_from_stage(open_stage(path, opening), **how)
     return scene_from_stage(_held(path, opening), **how)
@@ -161,6 +165,7 @@ def scene_from_stage(
     purposes: tuple[str, ...] = ("default", "render"),
     camera: str = "",
     complexity: str = "low",
+    pixels: int = 0,
     keep: Keep | None = None,
     orbits: bool = False,
 ) -> Scene:
@@ -174,6 +179,7 @@ def scene_from_stage(
         raise UsageError(f"time_code is {time_code}; it must be a finite number")
     if complexity not in FINENESS:
         raise UsageError(f"complexity is '{complexity}', not known; choose from {', '.join(FINENESS)}")
+    fineness = fineness_for(complexity, pixels)
     time = Usd.TimeCode(time_range(stage)[0] if time_code is None else time_code)
     notices = _composition_notices(stage)
     authored = stage
@@ -181,7 +187,7 @@ def scene_from_stage(
         stage = recognised(posed(stage, time, notices))
     with captured() as heard:
         try:
-            scene = _read(stage, time, purposes, camera, complexity, notices, keep, orbits)
+            scene = _read(stage, time, purposes, camera, fineness, notices, keep, orbits)
             # What is posed stands still.
             scene = replace(scene, cameras=with_shutters(authored, time, scene.cameras, notices))
         except Tf.ErrorException as error:
@@ -241,13 +247,13 @@ def _origin(low: F64, high: F64) -> F64:
 
 
 def _read(
-    stage: Usd.Stage, time: Usd.TimeCode, purposes: tuple[str, ...], camera: str, complexity: str,
+    stage: Usd.Stage, time: Usd.TimeCode, purposes: tuple[str, ...], camera: str, fineness: Fineness,
     notices: list[Notice], keep: Keep | None, orbits: bool,
 ) -> Scene:  # fmt: skip
     """Everything of a stage in engine world, whose origin is the middle of what is drawn."""
     metres_per_unit = stage_unit(stage, notices)
     metres_from_stage = _upright(stage, notices) @ np.diag([metres_per_unit] * 3 + [1.0])
-    tables = Tables(time, metres_per_unit, notices, FINENESS[complexity])
+    tables = Tables(time, metres_per_unit, notices, fineness)
     found = walk(stage, time, purposes, notices, as_drawn=True)
     lamps = [placement for placement in found if not placement.prim.IsA(UsdGeom.Gprim)]
     drawn = [placement for placement in found if placement.prim.IsA(UsdGeom.Gprim)]

@@ -119,7 +119,9 @@ def compare_stage(order: CompareOrder, report: Report, cancel: Callable[[], bool
         raise UsageError(f"the stage's RenderSettings choose the model '{settings.model}'; --suggest needs none")
     if order.suggest:  # its trials have numbers that the stage does not have at other times
         settings = replace(settings, motion_blur=False)
-    reader = partial(scene_from_stage, purposes=settings.purposes, camera=settings.camera)
+    reader = partial(
+        scene_from_stage, purposes=settings.purposes, camera=settings.camera, pixels=settings.longer_side
+    )
 
     def read(stage: Any, time_code: float | None = order.time_code) -> Scene:
         return apart(reader(stage, time_code=time_code), _MOST_APART)

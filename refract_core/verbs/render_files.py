@@ -17,7 +17,7 @@ from ..images.exr import USUAL, Layout
 from ..probes.digest import stale_bakes
 from ..progress import Report
 from ..scene import Notice, Scene
-from ..settings import AS_IT_IS, NO_ORBIT, Opening, RenderSettings, named_settings
+from ..settings import AS_IT_IS, NO_ORBIT, USUAL_PIXELS, Opening, RenderSettings, named_settings
 from .executors import Bench, Crew, file_bytes, patience, sent_stage, spread
 from .looks import Looks, check_unfinished
 from .orders import peak_memory, stop_if
@@ -438,7 +438,7 @@ def _how(shot: _Shot) -> dict[str, Any]:
     """What of a stage to read for a shot."""
     chosen = {"purposes": shot.settings.purposes, "camera": shot.settings.camera, "complexity": shot.complexity}
     own = {"orbits": True} if shot.settings.orbits else {}
-    return {"time_code": shot.time_code, **chosen, **own}
+    return {"time_code": shot.time_code, "pixels": shot.settings.longer_side, **chosen, **own}
 
 
 def _render_elsewhere(
@@ -513,8 +513,10 @@ def _stale(read: Callable[..., Scene], scene: Scene, shot: _Shot) -> list[Notice
     as coarse as they were then."""
     if not any(probe.bake for probe in scene.probes):
         return []
+    usual = shot.complexity == COMPLEXITIES[0] and shot.settings.longer_side <= USUAL_PIXELS
+
     def scene_at(time_code: float) -> Scene:
-        as_baked = shot.settings.purposes == RenderSettings().purposes and shot.complexity == COMPLEXITIES[0]
+        as_baked = shot.settings.purposes == RenderSettings().purposes and usual
         if time_code == scene.time_code and as_baked:
             return scene
         return read(time_code=time_code)

@@ -49,6 +49,7 @@ def load_stage(
     purposes: tuple[str, ...] = ("default", "render"),
     camera: str = "",
     complexity: str = "low",
+    pixels: int = 0,
     opening: Opening = AS_IT_IS,
 ) -> Scene:
     """Read a stage at one time; of a .mtlx file, balls of its materials; of glTF, what `convert` makes of it.
@@ -60,6 +61,8 @@ def load_stage(
         purposes: which of default, render, proxy and guide are drawn.
         camera: prim path or name of the camera that `Scene.cameras` begins with; '' chooses one.
         complexity: how fine subdivision surfaces are: low, medium, high or veryhigh.
+        pixels: longer side of the pictures that will be drawn; above 1024 surfaces of few faces are finer, as `render`
+            makes them.
         opening: session layer, variants and mask; of files, for an open stage is its owner's to change.
 
     Raises:
@@ -73,7 +76,8 @@ def load_stage(
     lost: list[Notice] = []
     if isinstance(path, str | os.PathLike):
         path = as_usd(os.fspath(path), lambda where, text: lost.append(Notice(where, text)))
-    scene = of_usd(path, time_code=time_code, purposes=purposes, camera=camera, complexity=complexity, opening=opening)
+    how: dict[str, Any] = {"purposes": purposes, "camera": camera, "complexity": complexity, "pixels": pixels}
+    scene = of_usd(path, time_code=time_code, opening=opening, **how)
     return replace(scene, notices=(*lost, *scene.notices)) if lost else scene
 
 

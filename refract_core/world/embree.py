@@ -162,6 +162,11 @@ class Bvh:
         self.handle = int(scene)
         """Address of the RTCScene, for kernels."""
 
+    @property
+    def points(self) -> NDArray[np.float32]:
+        """As they were given, shape (V, 3) [m]: the copy that Embree reads."""
+        return self._points[:-2]
+
     def _kept(self, array: NDArray[Any]) -> int:
         """Address of what Embree reads as long as this lives."""
         self._buffers.append(array)

@@ -323,6 +323,18 @@ class _Pile:
         self.triangle_count += len(triangles)
         return first, first_normal
 
+    def join_triangles(self) -> NDArray[np.uint32]:
+        """One table of all, and the parts' own are rows of it from then on: Embree reads what kernels read."""
+        table = _joined(self.triangles) if self.triangles else np.zeros((0, 3), np.uint32)
+        rows: dict[int, NDArray[np.uint32]] = {}  # parts that had one array still do
+        for k, part in enumerate(self.parts):
+            if part.triangles is not None:
+                first = self.rows[k][0]
+                own = rows.setdefault(id(part.triangles), table[first : first + len(part.triangles)])
+                self.parts[k] = part._replace(triangles=own)
+        self.triangles.clear()
+        return table
+
     def _add_primvars(
         self, primvars: dict[str, NDArray[np.float32]], *, shared: bool = False
     ) -> dict[str, tuple[int, int, int, int]]:
@@ -387,15 +399,15 @@ def pack_geometry(
             raise SceneError(f"{balls.paths[0]}: some rays see some of its spheres alone; settle the scene first")
         if len(balls):
             _add_balls(pile, balls, thing, seen.pop())
-    points = np.concatenate(pile.points) if pile.points else np.zeros((0, 3), np.float32)
-    bvh = Bvh(points, pile.parts)
+    triangles = pile.join_triangles()
+    bvh = Bvh(np.concatenate(pile.points) if pile.points else np.zeros((0, 3), np.float32), pile.parts)
     columns: list[Any] = list(zip(*pile.rows, strict=True)) or [()] * 10
     first, count, place, places, ball, sphere, thing_of, surface, sheet, first_normal = columns
     primvar_rows = np.array(pile.primvar_rows, np.int64).reshape(len(pile.rows), len(slots), 4)
     geometry = Geometry(
         handle=bvh.handle,
-        points=points,
-        triangles=_joined(pile.triangles) if pile.triangles else np.zeros((0, 3), np.uint32),
+        points=bvh.points,
+        triangles=triangles,
         material=np.concatenate(pile.material) if pile.material else np.zeros(0, np.int32),
         first=np.array(first, np.int64),
         primitives=np.array(count, np.int64),

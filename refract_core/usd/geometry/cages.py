@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from pxr import Usd, UsdGeom
 
 from ...scene import F32, F64, Notice
+from ...settings import USUAL_PIXELS
 from .refined import MOST_TRIANGLES, Cage, Edges, Fineness, steps_for, triangles_after
 from .subdivision import Scheme
 from .triangulate import Index, triangulate
@@ -22,6 +24,21 @@ FINENESS = {
     "high": Fineness(4, 1 << 19, 1 << 15), "veryhigh": Fineness(5, MOST_TRIANGLES, 1 << 17),
 }  # fmt: skip
 """By complexity. A dense cage is smooth as it is: where it has many faces, fewer steps will do."""
+
+
+def fineness_for(complexity: str, pixels: int) -> Fineness:
+    """How fine surfaces are to be.
+
+    In a larger picture a few faces are not enough for an outline: with two triangles for each pixel of its longer side,
+    a round surface that fills its height has chords that lie within a pixel of it.
+
+    Args:
+        complexity: of `FINENESS`
+        pixels: longer side of the picture; 0 for none in particular
+    """
+    usual = FINENESS[complexity]
+    few = max(usual.few, usual.few * pixels // USUAL_PIXELS)
+    return usual._replace(few=few, more=usual.more + math.ceil(math.log(few / usual.few, 4)))
 
 
 class Loops(NamedTuple):

@@ -76,8 +76,9 @@ def affordable(placements: Sequence[Placement], time: Usd.TimeCode, fineness: Fi
         drawn[placement.prim.GetPath()] += len(placement.worlds)
     prims = {placement.prim.GetPath(): placement.prim for placement in placements}
     meshes = [(UsdGeom.Mesh(prim), drawn[path]) for path, prim in prims.items() if is_subdivided(prim, time)]
+    usual = [one for one in FINENESS.values() if one.steps == fineness.steps]
     plain = [fineness._replace(steps=steps, few=0) for steps in range(fineness.steps, 0, -1)]
-    for fewer in (fineness, *plain):
+    for fewer in (fineness, *usual, *plain):
         sizes = [(times, surface_size(mesh, time, fewer)) for mesh, times in meshes]
         if sum(size if stays_one(times, size) else times * size for times, size in sizes) <= MOST_IN_ALL:
             return fewer

@@ -28,7 +28,8 @@ class Fineness(NamedTuple):
     triangles: int
     """Of one mesh, beyond which fewer steps are taken"""
     few: int = 0
-    """Of one mesh, under which up to `MORE_STEPS` more are taken: a face of a cube is a large part of its outline"""
+    """Of one mesh, under which up to `more` steps more are taken: a face of a cube is a large part of its outline"""
+    more: int = MORE_STEPS
 
 
 class Edges(NamedTuple):
@@ -66,7 +67,7 @@ def steps_for(cage_faces: int, cage_corners: int, quads: bool, scheme: Scheme, f
     """
     least = 0 if quads or scheme is Scheme.LOOP else 1
     steps = max(fineness.steps, least)
-    for _ in range(MORE_STEPS):
+    for _ in range(fineness.more):
         steps += triangles_after(cage_faces, cage_corners, scheme, steps) < fineness.few
     while steps > least and triangles_after(cage_faces, cage_corners, scheme, steps) > fineness.triangles:
         steps -= 1

@@ -357,6 +357,18 @@ def _normal_map(context: Context, shader: UsdShade.Shader, output: str, default:
     return source if even else scaled(source, (strength[0], strength[1], 1.0, 1.0))
 
 
+def _unit(context: Context, shader: UsdShade.Shader, output: str, default: Value, depth: int) -> Source | None:
+    """MaterialX `normalize` of three numbers: of a picture or primvar it is left to who takes it as a normal."""
+    if not str(shader.GetShaderId()).endswith("_vector3"):
+        return None
+    inner = read_source(context, shader.GetInput("in"), (0.0, 0.0, 0.0), depth + 1)
+    length = math.hypot(*inner.value[:3])
+    if not is_constant(inner) or length == 0.0:
+        return inner
+    x, y, z = (value / length for value in inner.value[:3])
+    return constant((x, y, z))
+
+
 def _geometric_normal(context: Context, shader: UsdShade.Shader, output: str, default: Value, depth: int) -> Source:
     """The surface's own normal, which in tangent space is straight up."""
     return constant((0.0, 0.0, 1.0))
@@ -496,6 +508,7 @@ _READERS: dict[str, Callable[[Context, UsdShade.Shader, str, Value, int], Source
     "dot": _pass,
     "constant": _constant,
     "normalmap": _normal_map,
+    "normalize": _unit,
     "multiply": _binary(0.0, 1.0, folding.product),
     "add": _binary(0.0, 0.0, folding.total),
     "subtract": _binary(0.0, 0.0, lambda context, a, b: folding.total(context, a, b, -1.0)),
