@@ -25,13 +25,14 @@ _FOREIGN = {"test_docs", "test_attack", "test_executors", "test_ahead", "test_op
 way."""
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest-xdist looks for groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what is quick; and keep what waits for processes, or for a wheel, to one worker (`--dist loadgroup`)."""
+    """Mark what is quick; and keep what waits for processes to one worker, and what needs a wheel (`--dist loadgroup`)."""
     for item in items:
         room = item.path.stem
         if "site" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.draws)
-            item.add_marker(pytest.mark.xdist_group("processes"))
+            item.add_marker(pytest.mark.xdist_group("wheel"))
         elif item.get_closest_marker("slow") and (room in _FOREIGN or room.startswith(("test_service", "test_page"))):
             item.add_marker(pytest.mark.xdist_group("processes"))
         if not (item.get_closest_marker("slow") or item.get_closest_marker("draws")):

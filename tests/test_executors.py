@@ -32,6 +32,15 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
 
+
+@pytest.mark.slow
+def test_what_watches_processes_is_kept_to_one_worker(request: pytest.FixtureRequest) -> None:
+    """By pytest-xdist, which says nothing where it does not."""
+    if not request.config.getoption("loadgroup", False):
+        pytest.skip("tests are not run by --dist loadgroup")
+    assert request.node.nodeid.endswith("@processes")
+
+
 STAGE = """#usda 1.0
 (
     metersPerUnit = 1
