@@ -27,7 +27,7 @@ way."""
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist looks for groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what is quick; and keep what waits for processes to one worker, and what needs a wheel (`--dist loadgroup`)."""
+    """Mark what is quick; keep what waits for processes to one worker, and what needs a wheel (`--dist loadgroup`)."""
     for item in items:
         room = item.path.stem
         if "site" in getattr(item, "fixturenames", ()):
