@@ -27,6 +27,7 @@ _BRANCH = 1 << 17
 """Branch of the sequences of what these rays meet."""
 _FAR = 1e30
 _LEAST_TRUST = 1e-4
+"""So that a place that speaks for much more than it knows still counts where there is no other."""
 
 
 class GatherScratch(NamedTuple):

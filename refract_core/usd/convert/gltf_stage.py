@@ -114,14 +114,12 @@ def _node(
             used.add(label)
             _mesh(stage, path.AppendChild(label), primitive, gltf, materials)
             scales[primitive.material].append(abs(float(np.linalg.det(world[:3, :3]))) ** (1.0 / 3.0))
-    for which, name in ((node.camera, "Camera"), (node.light, "Light")):
-        if which >= 0:
-            label = free_name(name, used)
-            used.add(label)
-            if name == "Camera":
-                define_view(stage, path.AppendChild(label), gltf.cameras[which])
-            else:
-                define_lamp(stage, path.AppendChild(label), gltf.lights[which])
+    if node.camera >= 0:
+        used.add(label := free_name("Camera", used))
+        define_view(stage, path.AppendChild(label), gltf.cameras[node.camera])
+    if node.light >= 0:
+        used.add(label := free_name("Light", used))
+        define_lamp(stage, path.AppendChild(label), gltf.lights[node.light])
     for label, child in zip(_names([gltf.nodes[n].name for n in node.children], used), node.children, strict=True):
         _node(stage, path.AppendChild(label), child, gltf, materials, world, scales, depth + 1)
 
