@@ -307,7 +307,7 @@ MUTANTS = (
            "scale(row(seen, lane), 1.0 - cover)", "scale(row(seen, lane), cover)", ("tests/test_shading.py",)),
     # --- what glows
     Mutant("every node is far enough to be a point", "world/glow.py", "_FAR = 8.0", "_FAR = 1.0", GLOWS),
-    Mutant("every node is flat", "world/glow.py", "_FLAT = 0.985", "_FLAT = 0.0", GLOWS),
+    Mutant("every node is flat", "world/glow.py", "FLAT = 0.985", "FLAT = 0.0", GLOWS),
     Mutant("what glows has no depth from afar", "world/glow_views.py",
            "first = dot(seen.place, n) +", "first = 0.0 * dot(seen.place, n) +", GLOWS),
     Mutant("a table is looked at from the other side", "world/glow.py",
