@@ -36,6 +36,7 @@ class OverrideValues(TypedDict, total=False):
     roughness: float
     transmittanceColor: list[float]
     absorptionDistance: float
+    abbeNumber: float
 
 
 class RenderSettings(TypedDict, total=False):

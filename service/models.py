@@ -48,6 +48,7 @@ class Override(Strict):
     roughness: Unit | None = None
     transmittanceColor: Annotated[list[Unit], Field(min_length=3, max_length=3)] | None = None
     absorptionDistance: Length | None = None
+    abbeNumber: Annotated[float, Field(ge=0.0, le=1000.0)] | None = None
 
 
 class StageOnly(Strict):

@@ -51,10 +51,11 @@ def Xform "World"
         float inputs:refraction:thickness = %(thickness)s
         color3f inputs:refraction:transmittanceColor = (%(color)s)
         float inputs:refraction:absorptionDistance = %(distance)s
+        float inputs:refraction:abbeNumber = %(abbe)s
     }
 }
 """
-AUTHORED = {"model": "sphere", "ior": 1.5, "thickness": 200.0, "color": "1, 1, 1", "distance": 100.0}
+AUTHORED = {"model": "sphere", "ior": 1.5, "thickness": 200.0, "color": "1, 1, 1", "distance": 100.0, "abbe": 0.0}
 
 
 def scene() -> rc.Scene:
@@ -75,7 +76,7 @@ def value(row: rc.scene.Material, param: Param) -> Any:
 
 def test_each_field_becomes_a_constant_in_metres() -> None:
     changes = {"model": "box", "ior": 1.2, "thickness": 3, "roughness": 0.25, "transmittanceColor": [1, 0.5, 0.25],
-               "absorptionDistance": 7}  # fmt: skip
+               "absorptionDistance": 7, "abbeNumber": 30}  # fmt: skip
     assert set(changes) == set(FIELDS)
     before = scene()
     matt, row = rc.override(before, {"/glass": changes}).materials
@@ -87,6 +88,7 @@ def test_each_field_becomes_a_constant_in_metres() -> None:
     assert value(row, Param.ROUGHNESS) == (0.25,) * 3
     assert value(row, Param.TRANSMITTANCE) == (1, 0.5, 0.25)
     assert row.absorption_distance == pytest.approx(0.07)
+    assert row.abbe == 30.0
     touched = {Param.IOR, Param.THICKNESS, Param.ROUGHNESS, Param.TRANSMITTANCE}
     for param in set(Param) - touched:
         assert row.inputs[param] == before.materials[1].inputs[param]
@@ -126,7 +128,8 @@ def test_what_becomes_glass_is_clear_and_what_becomes_thin_is_thin() -> None:
     [
         ({"ior": 0.5}, ["0.5", "1 to 10"]), ({"ior": float("nan")}, ["nan"]), ({"ior": True}, ["True"]),
         ({"ior": "1.5"}, ["1.5"]), ({"roughness": -0.1}, ["0 to 1"]), ({"thickness": 0}, ["above 0", "scene units"]),
-        ({"absorptionDistance": float("inf")}, ["inf"]), ({"model": "ball"}, ["none, sphere, box, thin, traced"]),
+        ({"absorptionDistance": float("inf")}, ["inf"]), ({"abbeNumber": -1}, ["0 to 1000"]),
+        ({"model": "ball"}, ["none, sphere, box, thin, traced"]),
         ({"transmittanceColor": [1, 1]}, ["1.0,1.0", "three numbers"]), ({"transmittanceColor": [0, 0, 2]}, ["0 to 1"]),
         ({"transmittanceColor": 1}, ["three numbers"]), ({"colour": 1}, ["not known", *FIELDS]),
     ],
@@ -196,15 +199,15 @@ def refract(*words: object) -> tuple[int, str]:
 
 
 CHANGED: dict[str, Any] = {"model": "box", "ior": 1.2, "thickness": 50, "transmittanceColor": "0.5,1,0.25",
-                           "absorptionDistance": 25}  # fmt: skip
+                           "absorptionDistance": 25, "abbeNumber": 25}  # fmt: skip
 FLAGS = [word for name, value in CHANGED.items() for word in ("--override", f"/World/Ball.{name}={value}")]
 QUICK = ["-w", "32", "--samples", "1", "--jobs", "1", "--progress", "none"]
 
 
 def test_an_override_draws_what_the_stage_would_if_it_were_authored(stage: Path, tmp_path: Path) -> None:
-    color, distance = CHANGED["transmittanceColor"], CHANGED["absorptionDistance"]
+    color, distance, abbe = (CHANGED[name] for name in ("transmittanceColor", "absorptionDistance", "abbeNumber"))
     other = tmp_path / "other.usda"
-    other.write_text(STAGE % {**CHANGED, "color": color, "distance": distance})
+    other.write_text(STAGE % {**CHANGED, "color": color, "distance": distance, "abbe": abbe})
     pictures = {}
     for name, of, flags in (("plain", stage, []), ("flags", stage, FLAGS), ("authored", other, [])):
         assert refract(of, tmp_path / f"{name}.png", *QUICK, *flags)[0] == 0

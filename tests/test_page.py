@@ -189,7 +189,7 @@ def test_settings_are_those_of_the_engine_and_what_is_usual_is_not_sent(module: 
 def test_the_service_takes_every_setting_of_the_page_and_the_stand_in_answers_as_it_does(module: Path) -> None:
     models = pytest.importorskip("service.models")
     override = {"model": "box", "ior": 1.2, "thickness": 1, "roughness": 0.5, "transmittanceColor": [1, 0, 0.5],
-                "absorptionDistance": 2}  # fmt: skip
+                "absorptionDistance": 2, "abbeNumber": 30}  # fmt: skip
     asked = js(
         module,
         "page.requestSettings(page.cleanSettings(given, null), null)",

@@ -160,7 +160,8 @@ Override = Annotated[
         metavar="PATH.FIELD=VALUE",
         help="Change one value of one material, such as /World/Marble.ior=1.33; may be repeated. PATH is a material, "
         "or a mesh or sphere bound to it. FIELD is model, ior (1 to 10), thickness, roughness (0 to 1), "
-        "transmittanceColor (red,green,blue, each 0 to 1) or absorptionDistance; lengths are in the stage's units.",
+        "transmittanceColor (red,green,blue, each 0 to 1), absorptionDistance or abbeNumber (0 is no dispersion); "
+        "lengths are in the stage's units.",
     ),
 ]
 MaxLayers = Annotated[

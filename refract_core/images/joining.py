@@ -113,7 +113,8 @@ def _size(piece: _Piece) -> str:
 def _read(path: str) -> _Piece:
     """Pixels as they are stored: 8 bits, halves, or floats that halves are in exactly."""
     if not Path(path).is_file():
-        raise ImageError(f"{path}: there is no such file; draw that part first, or correct the path")
+        text = "there is no such file; draw that part first, or correct the path (OUT comes before the parts)"
+        raise ImageError(f"{path}: {text}")
     with open_picture(path, path, as_stored=True) as file:
         words = str(file.spec().getattribute(PLACE) or "").split()
         if len(words) != 4 or not all(word.isdigit() for word in words):

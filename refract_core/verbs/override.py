@@ -18,7 +18,7 @@ Overrides = Mapping[str, Mapping[str, Any]]
 
 RANGES = {
     "ior": (1.0, 10.0), "thickness": (0.0, 1e9), "roughness": (0.0, 1.0), "transmittanceColor": (0.0, 1.0),
-    "absorptionDistance": (0.0, 1e9),
+    "absorptionDistance": (0.0, 1e9), "abbeNumber": (0.0, 1000.0),
 }  # fmt: skip
 """Valid numbers, both ends included, but a length is never 0. Lengths in scene units."""
 LENGTHS = ("thickness", "absorptionDistance")
@@ -46,8 +46,8 @@ def override(scene: Scene, overrides: Overrides, *, strict: bool = True) -> Scen
     the alphabet wins; the order they are given in has no meaning.
 
     Args:
-        overrides: fields are `model`, `ior`, `thickness`, `roughness`, `transmittanceColor` and `absorptionDistance`;
-            a value of None is passed over.
+        overrides: fields are `model`, `ior`, `thickness`, `roughness`, `transmittanceColor`, `absorptionDistance` and
+            `abbeNumber` (0 is no dispersion); a value of None is passed over.
         strict: False passes over paths that name nothing, as for things that are hidden at the scene's time.
 
     Raises:
@@ -156,7 +156,8 @@ def _overridden(material: Material, changes: Mapping[str, Any], unit: float) -> 
     if model.fixed_thickness:
         inputs[Param.THICKNESS] = _scalar(model.fixed_thickness)
         distance = model.fixed_thickness
-    return replace(material, inputs=tuple(inputs), model=model, absorption_distance=distance)
+    abbe = float(given.get("abbeNumber", material.abbe))
+    return replace(material, inputs=tuple(inputs), model=model, absorption_distance=distance, abbe=abbe)
 
 
 def _scalar(value: float) -> Source:

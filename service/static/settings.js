@@ -6,7 +6,7 @@ import { MODELS, SCREENS, TIERS } from "./words.js";
 export const ORBIT = ["azimuth", "elevation", "distance"];
 export const NUMBERS = ["image_width", "image_height", "samples", "max_layers", "exposure", "time_code", ...ORBIT];
 export const NO_ORBIT = { azimuth: null, elevation: null, distance: null, look_at: null };
-const GLASS_NUMBERS = ["ior", "thickness", "roughness", "absorptionDistance"];
+const GLASS_NUMBERS = ["ior", "thickness", "roughness", "absorptionDistance", "abbeNumber"];
 
 /** What a render of this stage does when nothing is asked, and a size that suits a page. */
 export function defaultSettings(facts) {
