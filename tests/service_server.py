@@ -102,6 +102,11 @@ class Server:
         return children(self.nursery())
 
 
+def files_under(folder: Path) -> list[Path]:
+    """All files and folders below one. `Path.rglob` fails where a folder goes away while it looks."""
+    return [Path(above, name) for above, folders, files in os.walk(folder) for name in (*folders, *files)]
+
+
 def children(pid: int) -> list[int]:
     """Processes that the first thread of a process started, and that are still there; none where it has ended."""
     try:

@@ -15,7 +15,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from service_server import BALL, ROOT, SMALL, Server, running, until, upload
+from service_server import BALL, ROOT, SMALL, Server, files_under, running, until, upload
 from service_stages import laughs
 
 from refract_core import RenderSettings, load_stage, render
@@ -112,7 +112,7 @@ def test_a_worker_cannot_tell_what_is_there(report: dict[str, dict[str, str]]) -
 def test_a_worker_that_takes_too_much_is_ended(client: httpx.Client, server: Server, do: str) -> None:
     answer = client.post("/v1/inspect", files=order(do, server.data))
     assert answer.json()["type"] == "/problems/limit-exceeded", answer.text
-    until(lambda: not [path for path in (server.data / "work").rglob("*") if re.fullmatch(r"a\d+|a{200}", path.name)])
+    until(lambda: not [path for path in files_under(server.data / "work") if re.fullmatch(r"a\d+|a{200}", path.name)])
 
 
 def test_every_sample_is_drawn_in_a_worker_as_it_is_without(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from typing import Any
 import httpx
 import pytest
 from pxr import Sdf, Usd, UsdUtils
-from service_server import BALL, PATIENT, ROOT, SMALL, Server, running, until, upload
+from service_server import BALL, PATIENT, ROOT, SMALL, Server, files_under, running, until, upload
 
 from service.problems import KINDS
 
@@ -205,7 +205,7 @@ def _draws(server: Server, exposure: float) -> None:
 
 def _uploads(server: Server) -> list[str]:
     """Files of clients, and files not written to their end."""
-    found = (path.name for path in server.data.rglob("*"))
+    found = (path.name for path in files_under(server.data))
     return [name for name in found if re.match(r"stage\.|upload-|\.[0-9a-f]{8}$", name)]
 
 

@@ -13,7 +13,7 @@ import httpx
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
-from service_server import BALL, LONG, PATIENT, ROOT, SMALL, Server, kill, running, until, upload
+from service_server import BALL, LONG, PATIENT, ROOT, SMALL, Server, files_under, kill, running, until, upload
 
 from refract_core.images.pictures import read_texture
 
@@ -343,7 +343,7 @@ def test_an_idle_service_leaves_nothing_behind(client: httpx.Client, server: Ser
     server.idle()
     until(lambda: len(list((server.data / "work").iterdir())) == 1)  # of the next worker
     until(lambda: len(server.workers()) == 1)
-    until(lambda: not list(server.data.rglob("stage.usd*")))
+    until(lambda: not [path for path in files_under(server.data) if path.name.startswith("stage.usd")])
 
 
 def test_a_browser_asks_anew_for_the_pages_files(client: httpx.Client) -> None:

@@ -22,7 +22,7 @@ from typing import Any
 
 import httpx
 import pytest
-from service_server import BALL, PATIENCE, ROOT, SMALL, InProcess, Server, running, until, upload
+from service_server import BALL, PATIENCE, ROOT, SMALL, InProcess, Server, files_under, running, until, upload
 
 from refract_core.errors import UsageError
 from service.app import Settings, create_app
@@ -374,7 +374,7 @@ def fill(disk: Path) -> Path:
 
 
 def files_of(disk: Path) -> set[str]:
-    return {str(path.relative_to(disk)) for path in (disk / "data").rglob("*") if path.is_file()}
+    return {str(path.relative_to(disk)) for path in files_under(disk / "data") if path.is_file()}
 
 
 @pytest.mark.skipif(not _CAN_MOUNT, reason="nothing may be mounted here")

@@ -10,7 +10,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from service_server import BALL, PATIENT, ROOT, InProcess, Server, running, until, upload
+from service_server import BALL, PATIENT, ROOT, InProcess, Server, files_under, running, until, upload
 
 from refract_core.images.pictures import read_texture
 from service.app import Settings, create_app
@@ -49,6 +49,10 @@ def opened(client: httpx.Client, **what: Any) -> str:
     return str(answer.headers["location"])
 
 
+def _stages(server: Server) -> list[Path]:
+    return [path for path in files_under(server.data) if path.name.startswith("stage.usd")]
+
+
 def drawn(client: httpx.Client, address: str, **settings: Any) -> httpx.Response:
     return client.post(f"{address}/pictures", json={**ORDER, **settings})
 
@@ -78,9 +82,9 @@ def test_a_live_picture_is_the_picture_that_a_render_makes(client: httpx.Client)
 def test_an_upload_can_be_looked_at_and_nothing_of_it_stays(client: httpx.Client, server: Server) -> None:
     address = opened(client, files=upload(BALL))
     assert pixels(drawn(client, address)).any()
-    assert list(server.data.rglob("stage.usd*"))
+    assert _stages(server)
     until(lambda: viewers(client) == 0)  # nobody asks any more
-    until(lambda: not list(server.data.rglob("stage.usd*")))
+    until(lambda: not _stages(server))
     until(lambda: len(list((server.data / "work").iterdir())) == 1)  # of the next worker
     assert drawn(client, address).status_code == 404
 
