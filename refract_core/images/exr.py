@@ -133,21 +133,19 @@ def _one(groups: Sequence[_Group], attributes: Mapping[str, Attribute], compress
     channels = [channel for group in groups for channel in group.channels]
     formats = ["half" if group.half else "float" for group in groups for _ in group.channels]
     height, width = groups[0].values.shape[:2]
-    kind = np.float16 if set(formats) == {"half"} else np.float32
-    pixels = np.empty((height, width, len(channels)), kind)
-    column = 0
-    for group in groups:
-        # A colour beyond the largest half would become infinity, which no viewer averages well.
-        values = group.values if _fits_half(group.values) or not group.half else np.clip(
-            group.values, -HALF_MAX, HALF_MAX)  # fmt: skip
-        pixels[..., column : column + len(group.channels)] = values
-        column += len(group.channels)
+    planes = [_within_half(group.values) if group.half and group.color else group.values for group in groups]
+    pixels = planes[0] if len(planes) == 1 else np.concatenate(planes, axis=-1)  # the writer makes halves of them
     spec = exr_spec(width, height, channels, formats, {}, compression)
     for key, value in attributes.items():
         _describe(spec, key, value)
     _describe(spec, "chromaticities", CHROMATICITIES_REC709)
     spec.attribute("colorInteropID", LINEAR_REC709 if any(group.color for group in groups) else "data")
     return Part(pixels, spec)
+
+
+def _within_half(values: F32) -> F32:
+    """A colour beyond the largest half would become infinity, which no viewer averages well."""
+    return np.clip(values, -HALF_MAX, HALF_MAX)
 
 
 def _describe(spec: Any, key: str, value: Attribute) -> None:
