@@ -27,6 +27,7 @@ ORACLE = "tests/test_oracle.py"
 LAWS = "tests/test_render_laws.py"
 CORNERS = ("tests/test_corners.py",)
 CAUSTICS = ("tests/test_caustics.py", "tests/test_shading.py", ORACLE)
+EDGES = ("tests/test_usd_edges.py",)
 GLOWS = ("tests/test_emission.py",)
 MANY = ("tests/test_instances.py", "tests/test_points.py")
 TREE = "tests/test_tree.py"
@@ -241,6 +242,10 @@ MUTANTS = (
            "> _STEP_OF_LAMP:", "> 2.0:", CORNERS),
     Mutant("any cell of the sky is filled", "view/quiet.py",
            "high[2] - low[2]) > care.step:", "high[2] - low[2]) > 2.0:", CORNERS),
+    Mutant("neighbours share a half shadow from one side", "view/quiet.py",
+           "k - down * _SPAN - right", "k + down * _SPAN + right", CORNERS),
+    Mutant("narrow half shadows are shared, too", "view/quiet.py", "_STEEP = 0.35, 0.8", "_STEEP = 9.0, 9.0", CORNERS),
+    Mutant("nobody shares a half shadow", "view/quiet.py", "_GRAIN = 0.2, 0.5", "_GRAIN = 0.0, 0.0", CORNERS),
     Mutant("a hidden sun takes all colours along", "world/shading.py",
            "return direction, scale(tint, cosine", "return direction, scale((1.0, 1.0, 1.0), cosine", CORNERS),
     Mutant("one ray to the sky minds no cosine", "world/shading.py",
@@ -332,6 +337,16 @@ MUTANTS = (
            "if len(numbers) <= 1:", "if len(numbers) <= 9:", MANY),
     Mutant("droplets have the normals that their distance gives", "world/surface.py",
            "ng = _exact_normal(centre, radius, ray, hit.t)", "ng = normalize(ng)", MANY),
+    # --- edges of glass
+    Mutant("edges are right angles", "usd/geometry/edges.py", "_EDGE = 0.5 - 1e-3", "_EDGE = -1e-3", EDGES),
+    Mutant("what is round is an edge", "usd/geometry/edges.py", "_EDGE = 0.5 - 1e-3", "_EDGE = 0.75", EDGES),
+    Mutant("seams are edges", "usd/geometry/edges.py",
+           "place = weld(shape.points)[shape.triangles]", "place = shape.triangles", EDGES),
+    Mutant("only what leans much hides an edge", "usd/geometry/edges.py",
+           "hidden = np.logical_or.reduceat(apart & alike, begins)",
+           "hidden = np.logical_or.reduceat(apart & alike, begins) & ((faces * given).sum(axis=1) < _SUSPECT)", EDGES),
+    Mutant("faces count alike, whatever their angle", "usd/geometry/edges.py",
+           "np.where(apart, 0.0, angles[other])", "np.where(apart, 0.0, 1.0)", EDGES),
     # --- what glows, again
     Mutant("a sheet that glows has one side", "world/emitters.py", "if geometry.sheet[part] != 0:", "if False:", GLOWS),
     Mutant("nobody is within what glows", "world/emitters.py",

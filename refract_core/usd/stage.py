@@ -51,7 +51,7 @@ Keep = Callable[[list[Placement], Tables], list[Placement]]
 FALLBACK_METRES_PER_UNIT = 0.01
 _WARNINGS = 20
 _LOOSE = re.compile(r"Found material bindings on prim at path \(([^)]*)\) but MaterialBindingAPI is not applied")
-_KINDS = ("MaterialX ", "MDL ", "elementSize ")
+_KINDS = ("MaterialX ", "MDL ", "elementSize ", "glass: ")
 """How notices begin that are said once of all prims: about a kind of node, or a mistake of a whole exporter."""
 
 

@@ -61,6 +61,11 @@ _STEP_OF_LAMP = 0.05
 """Share of a lamp's light by which neighbours differ that do not see the same of it. Shadows of glass are no steps."""
 _FLAT = 0.1
 """Part of their distance by which places may lie outside of each other's plane."""
+_GRAIN = 0.2, 0.5
+"""Share of a lamp's light, and of the sky's, by which the mean of two places across from each other may be off what
+stands between them, where that was asked by 16 rays: some three times what chance makes of them. Edges make more."""
+_STEEP = 0.35, 0.8
+"""And by which the 5x5 places around one may differ: the shape of a narrow half shadow is worth more than its grain."""
 _SHARP, _PIXELS = 0.02, 8.0
 """GGX width from which on neighbours share what they see in mirrors [alpha]; and the angles between two pixels that it
 is, at least."""
@@ -84,10 +89,14 @@ class QuietScratch(NamedTuple):
     """shape (N,): the same if nothing stood before them"""
     found: F64_2D
     """shape (N, 3): what of the light the finder's ray brings, 0 .. 1; -1 where the light would bring nothing"""
+    share: F64_2D
+    """shape (N, 3): and what many rays bring where that is in doubt"""
     rays: I32_1D
-    """shape (N,): 1 where the share of the sky is known"""
+    """shape (N,): 1 where rays were sent to the sky"""
     open: F64_2D
-    """shape (N, 3): and that share, colour by colour"""
+    """shape (N, 3): the share of it that is seen, colour by colour"""
+    alone: I32_1D
+    """shape (N,): 1 where the share of the light at hand, or of the sky, is known by a place's own few rays"""
     cells: I32_2D
     """shape (64, 4): cells yet to be done: first and last column and row"""
     free: Vectors
@@ -101,8 +110,9 @@ class QuietScratch(NamedTuple):
         count = _SPAN * _SPAN
         return QuietScratch(
             new_lanes(ViewScratch), new_lanes(Block, count), np.zeros(count, np.int32), np.zeros(count),
-            np.zeros(count), np.zeros((count, 3)), np.zeros(count, np.int32), np.zeros((count, 3)),
-            np.zeros((64, 4), np.int32), np.zeros((LANES, 3)), np.zeros((LANES, 3)),
+            np.zeros(count), np.zeros((count, 3)), np.zeros((count, 3)), np.zeros(count, np.int32),
+            np.zeros((count, 3)), np.zeros(count, np.int32), np.zeros((64, 4), np.int32),
+            np.zeros((LANES, 3)), np.zeros((LANES, 3)),
         )  # fmt: skip
 
 
@@ -133,7 +143,10 @@ def quiet_tile(
             for x in range(x0, x1):
                 i = _place(x - x0, y - y0)
                 if scratch.part[i] >= 0:
-                    put(scratch.places.sky_seen, i, row(scratch.open, i))
+                    share = row(scratch.open, i)
+                    if scratch.alone[i] != 0:
+                        share = _mean_around(scratch, scratch.open, i, care.rays, _GRAIN[1], _STEEP[1])
+                    put(scratch.places.sky_seen, i, share)
                     add_sky(scratch.places, i, world.environment)
     for y in range(y0, y1):
         for x in range(x0, x1):
@@ -226,14 +239,34 @@ def _light(
     lights, places, found = world.lights, scratch.places, scratch.found
     shadows = lights.casts_shadow[l] != 0
     _find(scratch, world, l, x0, y0, x1, y1)
+    wide, tall = x1 - x0, y1 - y0
+    some = False
+    for j in range(tall):
+        for i in range(wide):
+            k = _place(i, j)
+            doubt = shadows and scratch.part[k] >= 0 and found[k, 0] >= 0.0 and _in_doubt(scratch, k)
+            scratch.alone[k] = 1 if doubt else 0
+            put(scratch.share, k, row(found, k))
+            if doubt:
+                some = True
+                put(scratch.share, k, _share_of_lamp(scratch, world, care.rays, l, k, x0 + i, y0 + j))
+    if some:
+        for j in range(-_MARGIN, tall + _MARGIN):
+            for i in range(-_MARGIN, wide + _MARGIN):
+                k = _place(i, j)
+                if 0 <= i < wide and 0 <= j < tall:
+                    continue
+                put(scratch.share, k, row(found, k))
+                if found[k, 0] >= 0.0 and _is_asked(scratch, i, j, wide, tall):
+                    put(scratch.share, k, _share_of_lamp(scratch, world, care.rays, l, k, x0 + i, y0 + j))
     for y in range(y0, y1):
         for x in range(x0, x1):
             i = _place(x - x0, y - y0)
             if scratch.part[i] < 0 or found[i, 0] < 0.0:
                 continue
             share = row(found, i)
-            if shadows and _in_doubt(scratch, i):
-                share = _share_of_lamp(scratch, world, care.rays, l, i, x, y)
+            if scratch.alone[i] != 0:
+                share = _mean_around(scratch, scratch.share, i, care.rays, _GRAIN[0], _STEEP[0])
             put(places.lamp_seen, i, share)
             add_light(places, i, lights, l)
             for c in range(3):
@@ -313,7 +346,7 @@ def _find_sky(
 ) -> None:
     """The share of the sky that every place of the tile sees: cells of 8x8 pixels, cut in four where they must be."""
     for k in range(_SPAN * _SPAN):
-        scratch.rays[k] = 0
+        scratch.rays[k] = scratch.alone[k] = 0
     last_x, last_y = min(x1, view.size[0] - 1), min(y1, view.size[1] - 1)
     for cy in range(y0, y1, _CELL):
         for cx in range(x0, x1, _CELL):
@@ -323,6 +356,11 @@ def _find_sky(
             count = 1
             while count > 0:
                 count = _do_cell(scratch, world, care, count - 1, x0, y0)
+    wide, tall = x1 - x0, y1 - y0
+    for j in range(-_MARGIN, tall + _MARGIN):
+        for i in range(-_MARGIN, wide + _MARGIN):
+            if not (0 <= i < wide and 0 <= j < tall) and _is_asked(scratch, i, j, wide, tall):
+                _node(scratch, world, care, i, j, x0, y0)
 
 
 @inlined
@@ -365,6 +403,8 @@ def _fill(
             low = (min(low[0], share[0]), min(low[1], share[1]), min(low[2], share[2]))
             high = (max(high[0], share[0]), max(high[1], share[1]), max(high[2], share[2]))
     if small:
+        for k in range(4):
+            scratch.alone[_place(c if k % 2 else a, d if k // 2 else b)] = 1
         return True
     if max(high[0] - low[0], high[1] - low[1], high[2] - low[2]) > care.step:
         return False
@@ -408,6 +448,69 @@ def _node(scratch: QuietScratch, world: World, care: Care, i: int, j: int, x0: i
     scratch.rays[k] = 1
     put(scratch.open, k, share_of_sky(seen, asked, rays))
     return row(scratch.open, k)
+
+
+# --- few rays are grain -------------------------------------------------------------------------------------------
+
+
+@inlined
+def _is_asked(scratch: QuietScratch, i: int, j: int, wide: int, tall: int) -> bool:
+    """A place beside the tile stands so near to one of its own that was asked alone that it takes part in its mean."""
+    k = _place(i, j)
+    if scratch.part[k] < 0:
+        return False
+    for y in range(max(0, j - _MARGIN), min(tall, j + _MARGIN + 1)):
+        for x in range(max(0, i - _MARGIN), min(wide, i + _MARGIN + 1)):
+            if scratch.alone[_place(x, y)] != 0 and scratch.part[_place(x, y)] == scratch.part[k]:
+                return True
+    return False
+
+
+@inlined
+def _largest(v: Vec) -> float:
+    return max(abs(v[0]), abs(v[1]), abs(v[2]))
+
+
+@inlined
+def _is_beside(shares: F64_2D, k: int) -> bool:
+    """A place and its neighbours see all of a light, or all see nothing of it."""
+    own = row(shares, k)
+    if not (_largest(own) < 1e-6 or min(own[0], own[1], own[2]) > 1.0 - 1e-6):
+        return False
+    for down in range(-1, 2):
+        for right in range(-1, 2):
+            if _largest(sub(row(shares, k + down * _SPAN + right), own)) > 1e-6:
+                return False
+    return True
+
+
+@inlined
+def _mean_around(scratch: QuietScratch, shares: F64_2D, k: int, rays: int, grain: float, steep: float) -> Vec:
+    """The share that a place gets which was asked alone: the mean of the 5x5 around it, as `_mirrored` takes it, but
+    two by two, across from each other, so that no slope shifts it. The less the more rays have told, and not where the
+    3x3 around it all see all of the light, or nothing: that is beside a half shadow."""
+    own = row(shares, k)
+    total, weights = own, 1.0
+    if _is_beside(shares, k):
+        return own
+    grain *= min(1.0, 4.0 / math.sqrt(rays))
+    for down in range(_MARGIN + 1):
+        for right in range(-_MARGIN, _MARGIN + 1):
+            if down == 0 and right <= 0:
+                continue
+            one, other = k + down * _SPAN + right, k - down * _SPAN - right
+            if not (_alike(scratch, k, one, _ALIKE) and _alike(scratch, k, other, _ALIKE)):
+                continue
+            if shares[one, 0] < 0.0 or shares[other, 0] < 0.0:  # where a light brings nothing
+                continue
+            if max(_largest(sub(row(shares, one), own)), _largest(sub(row(shares, other), own))) > steep:
+                return own
+            pair = add(row(shares, one), row(shares, other))
+            if _largest(sub(scale(pair, 0.5), own)) > grain:
+                continue
+            weight = (0.5 if down == _MARGIN else 1.0) * (0.5 if abs(right) == _MARGIN else 1.0)
+            total, weights = along(total, pair, weight), weights + 2.0 * weight
+    return scale(total, 1.0 / weights)
 
 
 # --- what comes back ----------------------------------------------------------------------------------------------

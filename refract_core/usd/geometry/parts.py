@@ -10,10 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
+from ...models import Model
 from ...scene import F32, I32, Material, Notice, Texture
 from ..materials.read import display_color_material, read_material
 from .cages import FINENESS, is_subdivided, surface_size
 from .curves import Cut
+from .edges import HIDDEN, with_edges
 from .primvars import as_values, read_primvar, spread
 from .refined import Fineness
 from .shapes import Shape
@@ -125,6 +127,11 @@ def assemble(prim: Usd.Prim, shape: Shape, bound: Bound, tables: Tables) -> Part
     used = [tables.materials[number] for number in (materials[:1] if alike else np.unique(materials)).tolist()]
     if any(material.refractive for material in used):
         shape = shape.outwards  # only glass has a side that light enters by
+    of_faces = prim.GetTypeName() == "Mesh" and not (shape.subdivided or shape.cage)
+    if of_faces and any(material.model is Model.TRACED for material in used):
+        whole, shape = shape, with_edges(shape)
+        if shape is not whole:
+            tables.notices.append(Notice(str(prim.GetPath()), HIDDEN))
     wanted: frozenset[str] = frozenset()
     for material in used:
         wanted |= _primvars_of(material)
