@@ -27,6 +27,7 @@ ORACLE = "tests/test_oracle.py"
 LAWS = "tests/test_render_laws.py"
 CORNERS = ("tests/test_corners.py",)
 CAUSTICS = ("tests/test_caustics.py", "tests/test_shading.py", ORACLE)
+BODIES = ("tests/test_usd_light_bodies.py",)
 EDGES = ("tests/test_usd_edges.py",)
 GLOWS = ("tests/test_emission.py",)
 MANY = ("tests/test_instances.py", "tests/test_points.py")
@@ -337,6 +338,12 @@ MUTANTS = (
            "if len(numbers) <= 1:", "if len(numbers) <= 9:", MANY),
     Mutant("droplets have the normals that their distance gives", "world/surface.py",
            "ng = _exact_normal(centre, radius, ray, hit.t)", "ng = normalize(ng)", MANY),
+    # --- lights that the camera sees
+    Mutant("a light and its body both shine", "world/lamps.py", "and not light.seen]", "]", BODIES),
+    Mutant("plates glow at their backs", "usd/lights/bodies.py",
+           "np.arange(len(triangles)) >= len(triangles) - (len(x) - 2)",
+           "np.arange(len(triangles)) >= len(triangles) - 2 * (len(x) - 2)", BODIES),
+    Mutant("one hidden dome hides them all", "usd/lights/domes.py", "hidden=all(", "hidden=any(", BODIES),
     # --- edges of glass
     Mutant("edges are right angles", "usd/geometry/edges.py", "_EDGE = 0.5 - 1e-3", "_EDGE = -1e-3", EDGES),
     Mutant("what is round is an edge", "usd/geometry/edges.py", "_EDGE = 0.5 - 1e-3", "_EDGE = 0.75", EDGES),

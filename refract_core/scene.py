@@ -397,6 +397,8 @@ class Light:
     """Paths of the prims it lights (the `lightLink` collection); None means everything."""
     casters: tuple[str, ...] | None = None
     """Paths of the prims that cast its shadows (`shadowLink`); None means everything."""
+    seen: bool = False
+    """The camera sees it: where surfaces that glow give light, a body of its shape stands in its place."""
 
 
 @dataclass(frozen=True)

@@ -207,10 +207,24 @@ def _set_up(scene: Scene, settings: RenderSettings) -> tuple[Scene, Camera, tupl
     """The scene with what the settings put around it, who takes the picture, and what is to be said of it."""
     if not settings.camera_light:
         scene = replace(scene, camera_light=False)
+    if not settings.emission_light:
+        scene = _unseen(scene)
     scene = settled(scene)
     camera = camera_of(scene, settings)
     scene, notices = dressed(scene, camera, settings)
     return scene, camera, notices
+
+
+def _unseen(scene: Scene) -> Scene:
+    """The scene, whose lights shine themselves, and not by the bodies that stand for those that the camera sees."""
+    seen = {light.path for light in scene.lights if light.seen}
+    if not seen:
+        return scene
+    return replace(
+        scene, lights=tuple(replace(light, seen=False) for light in scene.lights),
+        meshes=tuple(mesh for mesh in scene.meshes if mesh.path not in seen),
+        spheres=tuple(ball for ball in scene.spheres if ball.path not in seen),
+    )  # fmt: skip
 
 
 def _guide(planes: dict[str, F32], guides: Sequence[Found], camera: Camera, settings: RenderSettings) -> int:

@@ -34,6 +34,7 @@ from .geometry.traverse import POINTS, Placement, refuse_too_many, some_of, told
 from .geometry.ways import with_ways
 from .layers import mtlx
 from .layers.write import is_gltf
+from .lights.bodies import lamp_bodies
 from .lights.meshes import glow_of, glowing, mesh_lights, own_glows
 from .lights.read import read_lights
 from .opening import mask_of, open_as
@@ -290,6 +291,8 @@ def _read(
     paths = tuple(dict.fromkeys(things))
     lit_by = [(lamp.prim, lamp.run.path(row), lamp.worlds[row]) for lamp in lamps for row in range(len(lamp.worlds))]
     lights, environment = read_lights(stage, time, purposes=purposes, drawn=paths, instanced=lit_by, **frame)
+    more_meshes, more_spheres, glows = lamp_bodies(lights, len(materials))
+    meshes, spheres, materials = (*meshes, *more_meshes), (*spheres, *more_spheres), [*materials, *glows]
     every = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
     glow = {m for m, material in enumerate(tables.materials) if material.emits}
     used = {m for mesh in every_mesh for m in np.unique(mesh.materials).tolist()}

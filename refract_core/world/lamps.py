@@ -26,7 +26,7 @@ def pack_lights(scene: Scene, eye: NDArray[np.float64], glow: Glow | None = None
     Args:
         glow: what the stage's own surfaces emit, if that lights anything.
     """
-    lights = [light for light in scene.lights if any(light.radiance)]
+    lights = [light for light in scene.lights if any(light.radiance) and not light.seen]
     roots = [-1] * len(lights) + list(glow.roots if glow else ())
     lights += glow.lights if glow else ()
     lights += [_camera_light(eye)] if scene.camera_light else []

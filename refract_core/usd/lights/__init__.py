@@ -1,3 +1,3 @@
 """UsdLux lights and domes as the light table and the environment. Knows no surface."""
 
-__all__ = ["meshes", "read"]
+__all__ = ["bodies", "meshes", "read"]

@@ -32,6 +32,8 @@ class Dome:
     """shape (H, W, 3) linear"""
     world_from_dome: F64
     """shape (3, 3), orthogonal"""
+    hidden: bool = False
+    """Not to be seen by the camera"""
 
 
 def read_dome(
@@ -98,7 +100,7 @@ def rotation(matrix: F64) -> F64:
 def sum_domes(domes: list[Dome]) -> Environment | None:
     """All domes as one map, in the frame of the first with a texture, at the largest resolution.
 
-    Domes turned otherwise are sampled bilinearly at every pixel's direction.
+    Domes turned otherwise are sampled bilinearly at every pixel's direction. They are hidden where all of them are.
     """
     if not domes:
         return None
@@ -114,7 +116,7 @@ def sum_domes(domes: list[Dome]) -> Environment | None:
             total += dome.pixels * dome.radiance
         else:
             _add_turned(total, dome.pixels, dome.world_from_dome.T @ frame, dome.radiance)
-    return Environment(total, np.ascontiguousarray(frame.T))
+    return Environment(total, np.ascontiguousarray(frame.T), hidden=all(dome.hidden for dome in domes))
 
 
 def directions(rows: slice, height: int, width: int) -> F64:

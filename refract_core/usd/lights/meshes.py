@@ -119,9 +119,14 @@ def _glow(context: Context, light: Usd.Prim, area: float) -> Material | None:
             return None
         factor = context.metres_per_unit**2 / area
     r, g, b_ = (channel * factor for channel in found)
+    return Material(str(light.GetPath()), black((r, g, b_)))
+
+
+def black(emission: tuple[float, float, float]) -> tuple[Source, ...]:
+    """Inputs of a surface that glows, and sends nothing back."""
     inputs = {param: Source(_four(_BLACK.get(param, (0.0,)))) for param in Param}
-    inputs[Param.EMISSIVE] = Source((r, g, b_, 1.0))
-    return Material(str(light.GetPath()), tuple(inputs[param] for param in Param))
+    inputs[Param.EMISSIVE] = Source((*emission, 1.0))
+    return tuple(inputs[param] for param in Param)
 
 
 def _four(values: tuple[float, ...]) -> tuple[float, float, float, float]:

@@ -13,6 +13,7 @@ from pxr import Usd, UsdGeom, UsdLux
 from ...scene import F64, Environment, Light, LightKind, Notice
 from ...world.embree import CASTER_SHIFTS
 from ..geometry.standins import is_replaced
+from .bodies import obstacle, seen_by_camera
 from .context import Context, note, number, value
 from .domes import Dome, read_dome, rotation, sum_domes
 from .emission import emission
@@ -120,7 +121,7 @@ def _read_light(
         dome = read_dome(
             light, context.time, radiance=shining, world_from_light=world_from_light, notices=context.notices
         )
-        domes.append(dome)
+        domes.append(replace(dome, hidden=seen_by_camera(context, prim) is False))
         return
     row = ROWS[name]
     shape = row.read(context, prim, world_from_light)
@@ -128,22 +129,27 @@ def _read_light(
         return
     r, g, b = (channel * shape.factor for channel in shining)
     casts_shadow, shadow = read_shadow(context, prim)
-    lights.append(
-        Light(
-            path=path,
-            kind=row.kind,
-            radiance=(r, g, b),
-            world_from_light=shape.world_from_light,
-            size=shape.size,
-            diffuse=number(context, prim, "inputs:diffuse", 1.0),
-            specular=number(context, prim, "inputs:specular", 1.0),
-            shaping=read_shaping(context, prim, row.kind, _turn(world_from_light)[1]),
-            casts_shadow=casts_shadow,
-            shadow=shadow,
-            lit=read_link(context, prim, "lightLink", drawn),
-            casters=read_link(context, prim, "shadowLink", drawn) if casts_shadow else None,
-        )
+    found = Light(
+        path=path,
+        kind=row.kind,
+        radiance=(r, g, b),
+        world_from_light=shape.world_from_light,
+        size=shape.size,
+        diffuse=number(context, prim, "inputs:diffuse", 1.0),
+        specular=number(context, prim, "inputs:specular", 1.0),
+        shaping=read_shaping(context, prim, row.kind, _turn(world_from_light)[1]),
+        casts_shadow=casts_shadow,
+        shadow=shadow,
+        lit=read_link(context, prim, "lightLink", drawn),
+        casters=read_link(context, prim, "shadowLink", drawn) if casts_shadow else None,
     )
+    if seen_by_camera(context, prim):
+        reason = obstacle(found)
+        if reason:
+            text = f"is to be seen by the camera, and a body cannot shine as it does: {reason}; it stays unseen"
+            note(context, prim, text)
+        found = replace(found, seen=not reason)
+    lights.append(found)
 
 
 def _shown(prim: Usd.Prim, time: Usd.TimeCode, purposes: tuple[str, ...]) -> bool:
