@@ -247,6 +247,8 @@ MUTANTS = (
            "k - down * _SPAN - right", "k + down * _SPAN + right", CORNERS),
     Mutant("narrow half shadows are shared, too", "view/quiet.py", "_STEEP = 0.35, 0.8", "_STEEP = 9.0, 9.0", CORNERS),
     Mutant("nobody shares a half shadow", "view/quiet.py", "_GRAIN = 0.2, 0.5", "_GRAIN = 0.0, 0.0", CORNERS),
+    Mutant("half shadows look at places that are not there", "view/quiet.py",
+           "if scratch.part[j] == scratch.part[k] and _largest(sub", "if _largest(sub", ("tests/test_crop.py",)),
     Mutant("a hidden sun takes all colours along", "world/shading.py",
            "return direction, scale(tint, cosine", "return direction, scale((1.0, 1.0, 1.0), cosine", CORNERS),
     Mutant("one ray to the sky minds no cosine", "world/shading.py",

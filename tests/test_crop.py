@@ -20,9 +20,13 @@ from typer.testing import CliRunner
 import refract_core as rc
 from refract_core.cli import app
 from refract_core.errors import UsageError
+from refract_core.kernels import lanes
+from refract_core.kernels.lanes import new_lanes
 from refract_core.scene import Scene
 from refract_core.view.camera import Tile
 from refract_core.view.crop import window_of
+from refract_core.view.quiet import QuietScratch
+from refract_core.world.embree import Packet
 
 GOOD = Path(__file__).parents[1] / "usd_samples" / "good"
 WAYS: dict[str, dict[str, Any]] = {
@@ -73,6 +77,38 @@ def test_a_part_is_that_part_of_the_whole_picture(way: str) -> None:
             window = x0, y0, dice.randrange(x0 + 1, SIZE[0]) + 1, dice.randrange(y0 + 1, SIZE[1]) + 1
             crop = tuple(float(at) for at in window)
             assert_part(whole, rc.render(scene, asked(**WAYS[way], crop=crop), session=session), window)
+
+
+def soiled(record: Any, left: float) -> Any:
+    """A thread's working memory as others may have left it, all but what Embree is told to do."""
+    for field in record:
+        if not isinstance(field, np.ndarray):
+            soiled(field, left)
+        elif not isinstance(record, Packet):
+            field[...] = left if field.dtype.kind == "f" or math.isfinite(left) else 3
+    return record
+
+
+@cache
+def clean_picture_of(name: str) -> rc.Frame:
+    return rc.render(scene_of(name), asked())
+
+
+@pytest.mark.parametrize("left", [-1.0, 1.0, math.nan])
+@pytest.mark.parametrize("name", ["two_probes", "glass_behind_glass"])
+def test_what_a_thread_has_left_behind_is_not_seen(name: str, left: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which thread draws which tile is chance: a kernel that read what the last tile left would draw by chance, too."""
+    clean = clean_picture_of(name)
+    made = []
+
+    def new(record: type, count: int = lanes.LANES) -> Any:
+        made.append(record)
+        return soiled(new_lanes(record, count), left)
+
+    monkeypatch.setattr(lanes, "new_lanes", new)
+    for plane, values in rc.render(scene_of(name), asked()).planes.items():
+        assert np.array_equal(as_bits(values), as_bits(clean.planes[plane])), plane
+    assert QuietScratch in made
 
 
 def test_a_part_through_a_lens_that_blurs_is_that_part_too() -> None:

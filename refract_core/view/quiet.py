@@ -472,14 +472,16 @@ def _largest(v: Vec) -> float:
 
 
 @inlined
-def _is_beside(shares: F64_2D, k: int) -> bool:
-    """A place and its neighbours see all of a light, or all see nothing of it."""
+def _is_beside(scratch: QuietScratch, shares: F64_2D, k: int) -> bool:
+    """A place and its neighbours on the same surface see all of a light, or all see nothing of it. What stands in the
+    rows of others is not of this tile: no surface is there, or nobody has asked it."""
     own = row(shares, k)
     if not (_largest(own) < 1e-6 or min(own[0], own[1], own[2]) > 1.0 - 1e-6):
         return False
     for down in range(-1, 2):
         for right in range(-1, 2):
-            if _largest(sub(row(shares, k + down * _SPAN + right), own)) > 1e-6:
+            j = k + down * _SPAN + right
+            if scratch.part[j] == scratch.part[k] and _largest(sub(row(shares, j), own)) > 1e-6:
                 return False
     return True
 
@@ -491,7 +493,7 @@ def _mean_around(scratch: QuietScratch, shares: F64_2D, k: int, rays: int, grain
     3x3 around it all see all of the light, or nothing: that is beside a half shadow."""
     own = row(shares, k)
     total, weights = own, 1.0
-    if _is_beside(shares, k):
+    if _is_beside(scratch, shares, k):
         return own
     grain *= min(1.0, 4.0 / math.sqrt(rays))
     for down in range(_MARGIN + 1):
