@@ -344,10 +344,10 @@ def disk_share(x: F64) -> F64:
     return np.asarray(0.5 + (x * np.sqrt(1 - x * x) + np.arcsin(x)) / math.pi)
 
 
-def half_shadow(lamp: Any, fov: float, **settings: Any) -> tuple[F64, F64]:
-    """Places along x, and the share of a lamp that is seen past a straight edge one metre above the floor at x = 0."""
+def half_shadow(lamp: Any, fov: float, at: float = 0.0, **settings: Any) -> tuple[F64, F64]:
+    """Places along x around `at`, and the share of a lamp that is seen past a straight edge one metre above the floor at x = 0."""
     card = quad("/card", [(-30, 1, 30), (0, 1, 30), (0, 1, -30), (-30, 1, -30)])
-    lens = above(0.0, fov)
+    lens = above(at, fov)
     floor = quad("/floor", FLOOR)
     open_, hidden = (
         draw(scene(things, [WHITE], lights=(lamp,), cameras=(lens,)), 48, 48, **{**GOOD, **settings})
@@ -390,6 +390,17 @@ def test_a_half_shadow_is_the_share_of_the_lamp_that_is_seen(
     assert errors[1] < 0.5 * errors[0]
 
 
+def test_a_half_shadow_of_four_pixels_is_found_wherever_it_falls() -> None:
+    """Cells of eight pixels are asked in their corners; between them, too, no place is black or white by chance."""
+    pixel = 0.06 / 4
+    for shift in range(0, 8, 2):
+        x, found = half_shadow(PANEL, 24 * pixel, shift * pixel)
+        expected = np.clip(0.5 + x * 5 / 0.3, 0, 1)
+        assert ((expected > 0.1) & (expected < 0.9)).sum() in (3, 4)
+        assert np.abs(found - expected).max() < 0.2
+        np.testing.assert_allclose(found.mean(0), expected, atol=0.03)
+
+
 def test_a_wide_half_shadow_and_a_sky_half_hidden_have_no_grain() -> None:
     """Past an edge, below a panel as wide as it hangs high, and under a sky that is bright at the zenith: at `good`
     next neighbours differ by little, and the picture is that of 64 times as many rays."""
@@ -405,6 +416,35 @@ def test_a_wide_half_shadow_and_a_sky_half_hidden_have_no_grain() -> None:
         assert abs(error.mean()) < 0.005
         assert rms(error) < off
         assert rms(error[:, 1:] - error[:, :-1]) < apart
+
+
+@pytest.mark.parametrize("kind", [LightKind.RECT, LightKind.DISK])
+def test_the_last_of_a_light_fades_into_the_dark(kind: LightKind) -> None:
+    """Past a slanting edge, where nearly all of a wide light is hidden: by quadrature over what is left of it. The
+    finders' single rays miss its last twentieth or hit it by chance, and left ragged borders of that height."""
+    n, half, turn = 200, 1.5, turned((0, 1, 0), 33)
+    panel = light(kind, (0, 3, 0), (0, -1, 0), (2.0 * half, 2.0 * half) if kind is LightKind.RECT else (half, 0.0), 1.0)
+    card = quad("/card", np.array([(-30, 1, 30), (0, 1, 30), (0, 1, -30), (-30, 1, -30)]) @ turn.T)
+    middle = turn @ (-0.47 * half, 0.9, 0.0)
+    lens = camera(middle, middle * (1, 0, 1), fov=0.3 * half, orthographic=True)
+    lit, free = (
+        draw(scene([quad("/floor", FLOOR), *things], [WHITE], lights=(panel,), cameras=(lens,)), 64, 64, **GOOD)
+        for things in ([card], [])
+    )
+    found = lit["beauty"][::7, :, 0] / free["beauty"][::7, :, 0]
+    u, v = np.meshgrid(*[(np.arange(n) + 0.5) / n * 2.0 - 1.0] * 2)
+    on = np.ones((n, n), bool) if kind is LightKind.RECT else u * u + v * v < 1.0
+    points = np.stack([half * u[on], np.full(on.sum(), 3.0), half * v[on]], -1)
+    expected = np.empty_like(found)
+    for at in np.ndindex(found.shape):
+        p = lit["P"][7 * at[0], at[1]].astype(np.float64)
+        worth = ((points - p) ** 2).sum(1) ** -2.0
+        seen = (points @ turn)[:, 0] > -2.0 * (p @ turn)[0]  # the edge, as the place sees it at the light's height
+        expected[at] = worth[seen].sum() / worth.sum()
+    deep = expected < 0.05
+    assert 50 < (expected[deep] > 0.005).sum() < deep.sum()
+    assert abs((found - expected).mean()) < 0.0015
+    assert rms((found - expected)[deep]) < 0.004
 
 
 def test_a_sharp_shadow_is_as_sharp_as_its_pixels() -> None:

@@ -23,12 +23,14 @@ from ..kernels.lanes import BLOCK_HEIGHT, BLOCK_WIDTH, LANES, Vectors, new_lanes
 from ..kernels.sampling import Key, set_key
 from ..kernels.vec import Vec, add, along, dot, length, lerp, mul, row, scale, sub
 from ..world.embree import COHERENT, EVERYTHING, OPAQUE, clear, has_hit
+from ..world.lights import has_rim
 from ..world.shading import (
     LOBES,
     Block,
     add_indirect,
     add_light,
     add_light_ray,
+    add_rim_ray,
     add_sky,
     add_sky_ray,
     aim_light,
@@ -95,6 +97,8 @@ class QuietScratch(NamedTuple):
     """shape (N,): 1 where rays were sent to the sky"""
     open: F64_2D
     """shape (N, 3): the share of it that is seen, colour by colour"""
+    torn: I32_1D
+    """shape (N,): 1 in corners of cells from where a part of the light at hand is seen, and a part is not"""
     alone: I32_1D
     """shape (N,): 1 where the share of the light at hand, or of the sky, is known by a place's own few rays"""
     cells: I32_2D
@@ -111,7 +115,7 @@ class QuietScratch(NamedTuple):
         return QuietScratch(
             new_lanes(ViewScratch), new_lanes(Block, count), np.zeros(count, np.int32), np.zeros(count),
             np.zeros(count), np.zeros((count, 3)), np.zeros((count, 3)), np.zeros(count, np.int32),
-            np.zeros((count, 3)), np.zeros(count, np.int32), np.zeros((64, 4), np.int32),
+            np.zeros((count, 3)), np.zeros(count, np.int32), np.zeros(count, np.int32), np.zeros((64, 4), np.int32),
             np.zeros((LANES, 3)), np.zeros((LANES, 3)),
         )  # fmt: skip
 
@@ -240,11 +244,13 @@ def _light(
     shadows = lights.casts_shadow[l] != 0
     _find(scratch, world, l, x0, y0, x1, y1)
     wide, tall = x1 - x0, y1 - y0
+    _find_torn(scratch, world, l, wide, tall)
     some = False
     for j in range(tall):
         for i in range(wide):
             k = _place(i, j)
-            doubt = shadows and scratch.part[k] >= 0 and found[k, 0] >= 0.0 and _in_doubt(scratch, k)
+            doubt = shadows and scratch.part[k] >= 0 and found[k, 0] >= 0.0
+            doubt = doubt and (_in_doubt(scratch, k) or _is_torn(scratch, k, i, j))
             scratch.alone[k] = 1 if doubt else 0
             put(scratch.share, k, row(found, k))
             if doubt:
@@ -306,6 +312,38 @@ def _find(scratch: QuietScratch, world: World, l: int, x0: int, y0: int, x1: int
                 x, y = bx + lane % BLOCK_WIDTH, by + lane // BLOCK_WIDTH
                 if packet.valid[lane] != 0:
                     put(scratch.found, _place(x - x0, y - y0), row(scratch.free, lane))
+
+
+@inlined
+def _find_torn(scratch: QuietScratch, world: World, l: int, wide: int, tall: int) -> None:  # noqa: E741
+    """Ask in the corners of all cells whether a light's rim is seen in part: a neighbour's single ray finds the last
+    twentieth of a light by chance, and deep half shadows would have ragged borders."""
+    lights, packet, found = world.lights, scratch.looking.packet, scratch.found
+    wanted = lights.casts_shadow[l] != 0 and has_rim(lights, l)
+    for j in range(0, tall + 1, _CELL):
+        for i in range(0, wide + 1, _CELL):
+            k = _place(i, j)
+            scratch.torn[k] = 0
+            if not wanted or scratch.part[k] < 0 or found[k, 0] < 0.0:
+                continue
+            clear(packet)
+            for lane in range(LANES):
+                add_rim_ray(scratch.places, k, lights, l, packet, lane)
+            lamp_visible(packet, world, OPAQUE, l, scratch.free)
+            for lane in range(LANES):
+                if packet.valid[lane] != 0 and _largest(sub(row(scratch.free, lane), row(found, k))) > _STEP_OF_LAMP:
+                    scratch.torn[k] = 1
+
+
+@inlined
+def _is_torn(scratch: QuietScratch, k: int, i: int, j: int) -> bool:
+    """Of the cell around a place a corner on the same surface sees a part of the light."""
+    for corner in range(4):
+        x, y = i // _CELL * _CELL + corner % 2 * _CELL, j // _CELL * _CELL + corner // 2 * _CELL
+        c = _place(x, y)
+        if scratch.part[c] == scratch.part[k] and scratch.found[c, 0] >= 0.0 and scratch.torn[c] != 0:
+            return True
+    return False
 
 
 @inlined

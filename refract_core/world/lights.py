@@ -36,11 +36,13 @@ _BEYOND = 1e30
 _LEAST = 1e-30
 """Weight of a point of a light that brings nothing: alone, it still says whether the light is hidden."""
 _NEAREST2 = 1e-12
+"""[m^2] squared distance that a light counts as having at least, so that nothing is divided by 0."""
+_INSET = 0.03
+"""Part of a light's width by which the points of its rim lie within: the light may fill a hole to its edge."""
 _POINTS, _STEP = 16, 7
 """Of a light, among which a single shadow ray picks one; and by how many sixteenths of its height each is higher."""
 _FAR2 = 64.0
 """Square of how many times its own size a light is away, from where on all of its points bring as much."""
-"""[m^2] squared distance that a light counts as having at least, so that nothing is divided by 0."""
 
 
 # --- the table ------------------------------------------------------------------------------------------------------
@@ -145,6 +147,28 @@ def shadow_ray(lights: LightTable, which: int, p: Vec, n: Vec, u1: float, u2: fl
     if lights.kind[which] != LightKind.DISTANT.value:
         worth /= max(distance * distance, _NEAREST2)
     return direction, distance, max(_LEAST, worth)
+
+
+@inlined
+def has_rim(lights: LightTable, which: int) -> bool:
+    """It may be seen in part."""
+    return lights.kind[which] == LightKind.GLOW.value or max(lights.size[which, 0], lights.size[which, 1]) > 0.0
+
+
+@inlined
+def rim_ray(lights: LightTable, which: int, p: Vec, n: Vec, k: int) -> tuple[Vec, float, float]:
+    """As `shadow_ray`, to the `k`-th of eight points along its rim, a little within. Of a light that is nearly hidden
+    what is left lies there, unless something stands before its middle alone; so these tell in eight rays where a
+    shadow is whole, and everywhere alike. What glows has no rim: to eight points all over it."""
+    kind = lights.kind[which]
+    u1, u2 = 1.0 - 2.0 * _INSET, k / 8.0
+    if kind == LightKind.GLOW.value:
+        u1, u2 = (k + 0.5) / 8.0, (k * _STEP / 8.0) % 1.0
+    elif kind == LightKind.RECT.value or kind == LightKind.CYLINDER.value:
+        # Row by row, without the middle of the middle row.
+        at = k if k < 4 else k + 1
+        u1, u2 = 0.5 + (at % 3 - 1) * (0.5 - _INSET), 0.5 + (at // 3 - 1) * (0.5 - _INSET)
+    return shadow_ray(lights, which, p, n, u1, u2)
 
 
 @inlined

@@ -23,7 +23,7 @@ from .bounced import bounced_light
 from .caustics import caustic_irradiance
 from .embree import SCATTERED, Packet, clear, has_hit, ray_direction, set_ray
 from .environment import TEXEL_LUMINANCE, EnvironmentTable, direction_pdf, irradiance, prefiltered, sample_direction
-from .lights import LightTable, any_glows, highlight, irradiance_factor, picked_shadow_ray, shadow_ray
+from .lights import LightTable, any_glows, highlight, irradiance_factor, picked_shadow_ray, rim_ray, shadow_ray
 from .offsets import off_surface
 from .shaping import shape_matt, shape_mirrored
 from .surface import Interaction, color_input, float_input, hit_in, interaction, normal_input, share_input, thing_of
@@ -37,6 +37,8 @@ take their reflection from the environment map alone."""
 _COAT_F0 = 0.04  # a clear coat of ior 1.5 (UsdPreviewSurface)
 _MOST_DRAWS = 32
 """Directions to the sky that are tried before one by the cosine alone is taken."""
+_LOW = 0.02
+"""Sine of a ray's height over a surface below which what it brings is too little to be asked for."""
 LOBES = 4
 """Rays to a light for each ray of a rough mirror: what it sees is lit by one more."""
 
@@ -368,6 +370,16 @@ def add_light_ray(
         distance = min(distance, _shadow_length(lights, l, key))
     add_shadow_ray(packet, lane, p, row(block.ng, i), direction, distance)
     return weight
+
+
+@inlined
+def add_rim_ray(block: Block, i: int, lights: LightTable, l: int, packet: Packet, lane: int) -> None:  # noqa: E741
+    """Put a ray from hit `i` to a point of a light's rim into a lane, unless it would bring nothing."""
+    p, n = row(block.point, i), row(block.ns, i)
+    direction, distance, _ = rim_ray(lights, l, p, n, lane)
+    if dot(direction, n) > _LOW:
+        distance = min(distance, lights.reach[l, 0])
+        add_shadow_ray(packet, lane, p, row(block.ng, i), direction, distance)
 
 
 @inlined
