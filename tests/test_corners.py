@@ -345,7 +345,8 @@ def disk_share(x: F64) -> F64:
 
 
 def half_shadow(lamp: Any, fov: float, at: float = 0.0, **settings: Any) -> tuple[F64, F64]:
-    """Places along x around `at`, and the share of a lamp that is seen past a straight edge one metre above the floor at x = 0."""
+    """Places along x around `at`, and the share of a lamp that is seen past a straight edge one metre above the floor
+    at x = 0."""
     card = quad("/card", [(-30, 1, 30), (0, 1, 30), (0, 1, -30), (-30, 1, -30)])
     lens = above(at, fov)
     floor = quad("/floor", FLOOR)
@@ -445,6 +446,25 @@ def test_the_last_of_a_light_fades_into_the_dark(kind: LightKind) -> None:
     assert 50 < (expected[deep] > 0.005).sum() < deep.sum()
     assert abs((found - expected).mean()) < 0.0015
     assert rms((found - expected)[deep]) < 0.004
+
+
+@pytest.mark.parametrize("kind", [LightKind.RECT, LightKind.DISK])
+def test_a_light_seen_through_a_slit_is_seen_everywhere(kind: LightKind) -> None:
+    """Its rim is hidden from two sides, and a tenth of it is seen: at most one place of a hundred finds nothing."""
+    half, turn = 1.5, turned((0, 1, 0), 20)
+    panel = light(kind, (0, 3, 0), (0, -1, 0), (2.0 * half, 2.0 * half) if kind is LightKind.RECT else (half, 0.0), 1.0)
+    cards = [
+        quad(f"/card{side}", np.array([(x, 1, 30), (x + 30, 1, 30), (x + 30, 1, -30), (x, 1, -30)]) @ turn.T)
+        for side, x in enumerate((0.04, -30.04))
+    ]
+    lens = camera((0, 0.9, 0), (0, 0, 0), fov=0.2, orthographic=True)
+    lit, free = (
+        draw(scene([quad("/floor", FLOOR), *things], [WHITE], lights=(panel,), cameras=(lens,)), 64, 64, **GOOD)
+        for things in (cards, [])
+    )
+    found = lit["beauty"][..., 0] / free["beauty"][..., 0]
+    assert 0.08 < found.mean() < 0.12
+    assert (found < 0.1 * found.mean()).mean() < 0.01
 
 
 def test_a_sharp_shadow_is_as_sharp_as_its_pixels() -> None:

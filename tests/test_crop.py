@@ -15,6 +15,7 @@ import OpenImageIO as oiio
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes import camera, light, material, quad, scene, turned
 from typer.testing import CliRunner
 
 import refract_core as rc
@@ -22,7 +23,7 @@ from refract_core.cli import app
 from refract_core.errors import UsageError
 from refract_core.kernels import lanes
 from refract_core.kernels.lanes import new_lanes
-from refract_core.scene import Scene
+from refract_core.scene import LightKind, Scene
 from refract_core.view.camera import Tile
 from refract_core.view.crop import window_of
 from refract_core.view.quiet import QuietScratch
@@ -89,13 +90,30 @@ def soiled(record: Any, left: float) -> Any:
     return record
 
 
+def half_shadows_at_the_edge() -> Scene:
+    """Slanting half shadows, two to eight pixels wide, that run over the end of the floor and that of the picture."""
+    turn = turned((0, 1, 0), 40)
+    bars = [
+        quad(f"/bar{k}", np.array([(x, 0.5, 9), (x + 0.3, 0.5, 9), (x + 0.3, 0.5, -9), (x, 0.5, -9)]) @ turn.T)
+        for k, x in enumerate(np.arange(-2.0, 2.0, 0.5))
+    ]
+    floor = quad("/floor", [(-9, 0, 9), (0.9, 0, 9), (0.9, 0, -9), (-9, 0, -9)])
+    lamps = [light(LightKind.DISTANT, (0, 9, 0), (0, -1, 0), (width, 0.0), 1.0) for width in (0.1, 0.3)]
+    lens = camera((0, 0.4, 0), (0, 0, 0), fov=1.0, orthographic=True)
+    return scene([floor, *bars], [material("/white", DIFFUSE=1.0)], lights=tuple(lamps), cameras=(lens,))
+
+
+def soiled_scene(name: str) -> Scene:
+    return half_shadows_at_the_edge() if name == "half shadows" else scene_of(name)
+
+
 @cache
 def clean_picture_of(name: str) -> rc.Frame:
-    return rc.render(scene_of(name), asked())
+    return rc.render(soiled_scene(name), asked())
 
 
 @pytest.mark.parametrize("left", [-1.0, 1.0, math.nan])
-@pytest.mark.parametrize("name", ["two_probes", "glass_behind_glass"])
+@pytest.mark.parametrize("name", ["half shadows", "two_probes", "glass_behind_glass"])
 def test_what_a_thread_has_left_behind_is_not_seen(name: str, left: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Which thread draws which tile is chance: a kernel that read what the last tile left would draw by chance, too."""
     clean = clean_picture_of(name)
@@ -106,7 +124,7 @@ def test_what_a_thread_has_left_behind_is_not_seen(name: str, left: float, monke
         return soiled(new_lanes(record, count), left)
 
     monkeypatch.setattr(lanes, "new_lanes", new)
-    for plane, values in rc.render(scene_of(name), asked()).planes.items():
+    for plane, values in rc.render(soiled_scene(name), asked()).planes.items():
         assert np.array_equal(as_bits(values), as_bits(clean.planes[plane])), plane
     assert QuietScratch in made
 

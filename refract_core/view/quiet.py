@@ -66,8 +66,8 @@ _FLAT = 0.1
 _GRAIN = 0.2, 0.5
 """Share of a lamp's light, and of the sky's, by which the mean of two places across from each other may be off what
 stands between them, where that was asked by 16 rays: some three times what chance makes of them. Edges make more."""
-_STEEP = 0.35, 0.8
-"""And by which the 5x5 places around one may differ: the shape of a narrow half shadow is worth more than its grain."""
+_STEEP = 0.05, 0.25
+"""And by which it may grow from pixel to pixel: the shape of a narrow half shadow is worth more than its grain."""
 _SHARP, _PIXELS = 0.02, 8.0
 """GGX width from which on neighbours share what they see in mirrors [alpha]; and the angles between two pixels that it
 is, at least."""
@@ -98,9 +98,11 @@ class QuietScratch(NamedTuple):
     open: F64_2D
     """shape (N, 3): the share of it that is seen, colour by colour"""
     torn: I32_1D
-    """shape (N,): 1 in corners of cells from where a part of the light at hand is seen, and a part is not"""
+    """shape (N,): 1 in corners of cells from where a part of the light at hand is seen and a part is not, -1 in others
+    that were asked"""
     alone: I32_1D
-    """shape (N,): 1 where the share of the light at hand, or of the sky, is known by a place's own few rays"""
+    """shape (N,): 1 where the share of the light at hand, or of the sky, is known by a place's own few rays; 2 where
+    its rim says that it is seen in part"""
     cells: I32_2D
     """shape (64, 4): cells yet to be done: first and last column and row"""
     free: Vectors
@@ -250,8 +252,9 @@ def _light(
         for i in range(wide):
             k = _place(i, j)
             doubt = shadows and scratch.part[k] >= 0 and found[k, 0] >= 0.0
-            doubt = doubt and (_in_doubt(scratch, k) or _is_torn(scratch, k, i, j))
-            scratch.alone[k] = 1 if doubt else 0
+            between = doubt and _is_between(scratch, i, j)
+            doubt = between or (doubt and _in_doubt(scratch, k))
+            scratch.alone[k] = 2 if between else 1 if doubt else 0
             put(scratch.share, k, row(found, k))
             if doubt:
                 some = True
@@ -316,34 +319,62 @@ def _find(scratch: QuietScratch, world: World, l: int, x0: int, y0: int, x1: int
 
 @inlined
 def _find_torn(scratch: QuietScratch, world: World, l: int, wide: int, tall: int) -> None:  # noqa: E741
-    """Ask in the corners of all cells whether a light's rim is seen in part: a neighbour's single ray finds the last
-    twentieth of a light by chance, and deep half shadows would have ragged borders."""
-    lights, packet, found = world.lights, scratch.looking.packet, scratch.found
-    wanted = lights.casts_shadow[l] != 0 and has_rim(lights, l)
+    """Ask in the corners of all cells whether a light's rim is seen in part, and where it is in those of their
+    quarters: a neighbour's single ray finds the last twentieth of a light by chance, and deep half shadows would have
+    ragged borders."""
+    for k in range(_SPAN * _SPAN):
+        scratch.torn[k] = 0
+    if world.lights.casts_shadow[l] == 0 or not has_rim(world.lights, l):
+        return
     for j in range(0, tall + 1, _CELL):
         for i in range(0, wide + 1, _CELL):
-            k = _place(i, j)
-            scratch.torn[k] = 0
-            if not wanted or scratch.part[k] < 0 or found[k, 0] < 0.0:
-                continue
-            clear(packet)
-            for lane in range(LANES):
-                add_rim_ray(scratch.places, k, lights, l, packet, lane)
-            lamp_visible(packet, world, OPAQUE, l, scratch.free)
-            for lane in range(LANES):
-                if packet.valid[lane] != 0 and _largest(sub(row(scratch.free, lane), row(found, k))) > _STEP_OF_LAMP:
-                    scratch.torn[k] = 1
+            _ask_rim(scratch, world, l, i, j)
+    half = _CELL // 2
+    for y in range(0, tall, _CELL):
+        for x in range(0, wide, _CELL):
+            if _is_torn(scratch, _place(x, y), _CELL, -1):
+                for part in range(1, 9):
+                    i, j = x + part % 3 * half, y + part // 3 * half
+                    if (i % _CELL != 0 or j % _CELL != 0) and i <= wide and j <= tall:
+                        _ask_rim(scratch, world, l, i, j)
 
 
 @inlined
-def _is_torn(scratch: QuietScratch, k: int, i: int, j: int) -> bool:
-    """Of the cell around a place a corner on the same surface sees a part of the light."""
+def _ask_rim(scratch: QuietScratch, world: World, l: int, i: int, j: int) -> None:  # noqa: E741
+    """Note whether a place sees a part of a light, and a part not."""
+    # Corners beside each other, of cells as of quarters, look at other points.
+    k, turn = _place(i, j), (i // _CELL + j // _CELL + i // (_CELL // 2) + j // (_CELL // 2)) % 2
+    packet, found = scratch.looking.packet, row(scratch.found, k)
+    if scratch.part[k] < 0 or found[0] < 0.0 or scratch.torn[k] != 0:
+        return
+    scratch.torn[k] = -1
+    clear(packet)
+    for lane in range(LANES):
+        add_rim_ray(scratch.places, k, world.lights, l, packet, lane, turn)
+    lamp_visible(packet, world, OPAQUE, l, scratch.free)
+    for lane in range(LANES):
+        if packet.valid[lane] != 0 and _largest(sub(row(scratch.free, lane), found)) > _STEP_OF_LAMP:
+            scratch.torn[k] = 1
+
+
+@inlined
+def _is_torn(scratch: QuietScratch, first: int, side: int, part: int) -> bool:
+    """From a corner of a cell of so many pixels a side, the upper left one first, a part of the light is seen; `part`:
+    from one on this piece of a surface, -1 on any."""
     for corner in range(4):
-        x, y = i // _CELL * _CELL + corner % 2 * _CELL, j // _CELL * _CELL + corner // 2 * _CELL
-        c = _place(x, y)
-        if scratch.part[c] == scratch.part[k] and scratch.found[c, 0] >= 0.0 and scratch.torn[c] != 0:
+        k = first + corner % 2 * side + corner // 2 * side * _SPAN
+        if scratch.torn[k] > 0 and (part < 0 or scratch.part[k] == part):
             return True
     return False
+
+
+@inlined
+def _is_between(scratch: QuietScratch, i: int, j: int) -> bool:
+    """A place lies in a cell, and in a quarter of it, with a corner on its surface that sees a part of the light."""
+    half, part = _CELL // 2, scratch.part[_place(i, j)]
+    return _is_torn(scratch, _place(i // _CELL * _CELL, j // _CELL * _CELL), _CELL, part) and _is_torn(
+        scratch, _place(i // half * half, j // half * half), half, part
+    )
 
 
 @inlined
@@ -531,9 +562,11 @@ def _mean_around(scratch: QuietScratch, shares: F64_2D, k: int, rays: int, grain
     3x3 around it all see all of the light, or nothing: that is beside a half shadow."""
     own = row(shares, k)
     total, weights = own, 1.0
-    if _is_beside(scratch, shares, k):
+    if scratch.alone[k] == 1 and _is_beside(scratch, shares, k):
         return own
     grain *= min(1.0, 4.0 / math.sqrt(rays))
+    # The plane through the 5x5, by least squares: its slopes are sums over the rises from one to the other.
+    rightward, downward, squares_right, squares_down = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, 0.0
     for down in range(_MARGIN + 1):
         for right in range(-_MARGIN, _MARGIN + 1):
             if down == 0 and right <= 0:
@@ -543,13 +576,16 @@ def _mean_around(scratch: QuietScratch, shares: F64_2D, k: int, rays: int, grain
                 continue
             if shares[one, 0] < 0.0 or shares[other, 0] < 0.0:  # where a light brings nothing
                 continue
-            if max(_largest(sub(row(shares, one), own)), _largest(sub(row(shares, other), own))) > steep:
-                return own
+            rise = sub(row(shares, one), row(shares, other))
+            rightward, downward = along(rightward, rise, right), along(downward, rise, down)
+            squares_right, squares_down = squares_right + 2.0 * right * right, squares_down + 2.0 * down * down
             pair = add(row(shares, one), row(shares, other))
             if _largest(sub(scale(pair, 0.5), own)) > grain:
                 continue
             weight = (0.5 if down == _MARGIN else 1.0) * (0.5 if abs(right) == _MARGIN else 1.0)
             total, weights = along(total, pair, weight), weights + 2.0 * weight
+    if max(_largest(rightward) / max(squares_right, 1.0), _largest(downward) / max(squares_down, 1.0)) > steep:
+        return own
     return scale(total, 1.0 / weights)
 
 

@@ -156,18 +156,25 @@ def has_rim(lights: LightTable, which: int) -> bool:
 
 
 @inlined
-def rim_ray(lights: LightTable, which: int, p: Vec, n: Vec, k: int) -> tuple[Vec, float, float]:
-    """As `shadow_ray`, to the `k`-th of eight points along its rim, a little within. Of a light that is nearly hidden
-    what is left lies there, unless something stands before its middle alone; so these tell in eight rays where a
-    shadow is whole, and everywhere alike. What glows has no rim: to eight points all over it."""
+def rim_ray(lights: LightTable, which: int, p: Vec, n: Vec, k: int, turn: int) -> tuple[Vec, float, float]:
+    """As `shadow_ray`, to the `k`-th of eight points which tell whether a light is seen in part: most along its rim, a
+    little within, where the last of a light lies that sinks behind an edge; some in its middle, which may be seen
+    between two edges. `turn`: 0 or 1, two such sets whose points lie between each other's."""
     kind = lights.kind[which]
-    u1, u2 = 1.0 - 2.0 * _INSET, k / 8.0
-    if kind == LightKind.GLOW.value:
-        u1, u2 = (k + 0.5) / 8.0, (k * _STEP / 8.0) % 1.0
+    if kind == LightKind.GLOW.value:  # all over it
+        u1, u2 = (k + 0.5) / 8.0, ((k * _STEP + 4 * turn) / 8.0) % 1.0
     elif kind == LightKind.RECT.value or kind == LightKind.CYLINDER.value:
-        # Row by row, without the middle of the middle row.
-        at = k if k < 4 else k + 1
-        u1, u2 = 0.5 + (at % 3 - 1) * (0.5 - _INSET), 0.5 + (at // 3 - 1) * (0.5 - _INSET)
+        # Four corners, in which whatever hides a rectangle from one side ends; four that no row or column has twice.
+        right, up = k % 2, k // 2 % 2
+        if k < 4:
+            u1, u2 = (1.0 - _INSET if right else _INSET), (1.0 - _INSET if up else _INSET)
+        elif turn == 0:
+            u1, u2 = (0.5, 0.25 + 0.5 * up) if right else (0.25 + 0.5 * up, 0.5)
+        else:
+            u1, u2 = 0.125 + (0.25 if up else 0.0) + 0.5 * right, 0.375 - (0.25 if right else 0.0) + 0.5 * up
+    else:
+        angle = (k + 0.5 * turn) / 6.0 if k < 6 else 0.5 * k + 0.25 * turn
+        u1, u2 = (1.0 - 2.0 * _INSET if k < 6 else 0.25), angle % 1.0
     return shadow_ray(lights, which, p, n, u1, u2)
 
 

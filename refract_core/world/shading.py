@@ -373,10 +373,12 @@ def add_light_ray(
 
 
 @inlined
-def add_rim_ray(block: Block, i: int, lights: LightTable, l: int, packet: Packet, lane: int) -> None:  # noqa: E741
+def add_rim_ray(
+    block: Block, i: int, lights: LightTable, l: int, packet: Packet, lane: int, turn: int  # noqa: E741
+) -> None:
     """Put a ray from hit `i` to a point of a light's rim into a lane, unless it would bring nothing."""
     p, n = row(block.point, i), row(block.ns, i)
-    direction, distance, _ = rim_ray(lights, l, p, n, lane)
+    direction, distance, _ = rim_ray(lights, l, p, n, lane, turn)
     if dot(direction, n) > _LOW:
         distance = min(distance, lights.reach[l, 0])
         add_shadow_ray(packet, lane, p, row(block.ng, i), direction, distance)
