@@ -176,7 +176,8 @@ def _cells(values: Mapping[str, float]) -> Sequence[str]:
 def block(found: Found, options: Options) -> str:
     """What the page gets."""
     width = options.width
-    how = f"`python -m benchmarks.light{' --knobs' if options.knobs else ''}` on {pages.machine()}"
+    asked = (" --knobs" if options.knobs else "") + (f" --width {width}" if width != Options().width else "")
+    how = f"`python -m benchmarks.light{asked}` on {pages.machine()}"
     size = f"{width} x {width * 9 // 16}, {options.jobs or os.cpu_count()} threads"
     truth = f"the truth has {found.truth.samples} samples a pixel"
     return f"{how}, {size}, medians of {options.repeat}; {truth}; dB:\n\n{table(found)}"

@@ -250,6 +250,7 @@ MUTANTS = (
     Mutant("nobody looks for the last of a light", "view/quiet.py",
            "scratch.torn[k] = 1\n", "scratch.torn[k] = 0\n", CORNERS),
     Mutant("the rim of a light is its middle", "world/lights.py", "_INSET = 0.03", "_INSET = 0.45", CORNERS),
+    Mutant("every light is faint", "view/quiet.py", "_FAINT = 1.0 / 32.0", "_FAINT = 2.0", CORNERS),
     Mutant("nobody looks at the middle of a light", "world/lights.py",
            "u1, u2 = (0.5, 0.25 + 0.5 * up) if right", "u1, u2 = (0.0, 0.25 + 0.5 * up) if right", CORNERS),
     Mutant("half shadows look at places that are not there", "view/quiet.py",

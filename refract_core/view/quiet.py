@@ -61,6 +61,8 @@ _ALIKE = 0.95
 """Cosine of normals between which light is interpolated."""
 _STEP_OF_LAMP = 0.05
 """Share of a lamp's light by which neighbours differ that do not see the same of it. Shadows of glass are no steps."""
+_FAINT = 1.0 / 32.0
+"""Share of what all lights bring up to which the last of one is not looked for: a sixteenth of it would not be seen."""
 _FLAT = 0.1
 """Part of their distance by which places may lie outside of each other's plane."""
 _GRAIN = 0.2, 0.5
@@ -97,6 +99,8 @@ class QuietScratch(NamedTuple):
     """shape (N,): 1 where rays were sent to the sky"""
     open: F64_2D
     """shape (N, 3): the share of it that is seen, colour by colour"""
+    bright: F64_1D
+    """shape (N,): what all lights would bring to the corners of cells if nothing stood before them"""
     torn: I32_1D
     """shape (N,): 1 in corners of cells from where a part of the light at hand is seen and a part is not, -1 in others
     that were asked"""
@@ -117,7 +121,8 @@ class QuietScratch(NamedTuple):
         return QuietScratch(
             new_lanes(ViewScratch), new_lanes(Block, count), np.zeros(count, np.int32), np.zeros(count),
             np.zeros(count), np.zeros((count, 3)), np.zeros((count, 3)), np.zeros(count, np.int32),
-            np.zeros((count, 3)), np.zeros(count, np.int32), np.zeros(count, np.int32), np.zeros((64, 4), np.int32),
+            np.zeros((count, 3)), np.zeros(count), np.zeros(count, np.int32), np.zeros(count, np.int32),
+            np.zeros((64, 4), np.int32),
             np.zeros((LANES, 3)), np.zeros((LANES, 3)),
         )  # fmt: skip
 
@@ -141,6 +146,7 @@ def quiet_tile(
     x0, y0 = tile[0], tile[1]
     x1, y1 = min(tile[2], view.size[0]), min(tile[3], view.size[1])
     glass = _look(scratch, world, view, layer, x0, y0, x1, y1)
+    _add_up(scratch, world, x1 - x0, y1 - y0)
     for l in range(world.lights.kind.shape[0]):  # noqa: E741
         _light(scratch, world, view, care, l, x0, y0, x1, y1)
     if world.environment.present and not world.environment.dark:
@@ -246,13 +252,13 @@ def _light(
     shadows = lights.casts_shadow[l] != 0
     _find(scratch, world, l, x0, y0, x1, y1)
     wide, tall = x1 - x0, y1 - y0
-    _find_torn(scratch, world, l, wide, tall)
+    torn = _find_torn(scratch, world, l, wide, tall)
     some = False
     for j in range(tall):
         for i in range(wide):
             k = _place(i, j)
             doubt = shadows and scratch.part[k] >= 0 and found[k, 0] >= 0.0
-            between = doubt and _is_between(scratch, i, j)
+            between = doubt and torn and _is_between(scratch, i, j)
             doubt = between or (doubt and _in_doubt(scratch, k))
             scratch.alone[k] = 2 if between else 1 if doubt else 0
             put(scratch.share, k, row(found, k))
@@ -318,17 +324,41 @@ def _find(scratch: QuietScratch, world: World, l: int, x0: int, y0: int, x1: int
 
 
 @inlined
-def _find_torn(scratch: QuietScratch, world: World, l: int, wide: int, tall: int) -> None:  # noqa: E741
-    """Ask in the corners of all cells whether a light's rim is seen in part, and where it is in those of their
-    quarters: a neighbour's single ray finds the last twentieth of a light by chance, and deep half shadows would have
-    ragged borders."""
-    for k in range(_SPAN * _SPAN):
-        scratch.torn[k] = 0
-    if world.lights.casts_shadow[l] == 0 or not has_rim(world.lights, l):
-        return
+def _worth(scratch: QuietScratch, world: World, l: int, k: int) -> float:  # noqa: E741
+    """What a light that has been aimed at a place would bring there."""
+    return _largest(row(world.lights.radiance, l)) * (scratch.places.lamp_diffuse[k] + scratch.places.lamp_specular[k])
+
+
+@inlined
+def _add_up(scratch: QuietScratch, world: World, wide: int, tall: int) -> None:
+    """Note in the corners of cells what all lights would bring."""
     for j in range(0, tall + 1, _CELL):
         for i in range(0, wide + 1, _CELL):
-            _ask_rim(scratch, world, l, i, j)
+            k = _place(i, j)
+            scratch.bright[k] = 0.0
+            if scratch.part[k] < 0:
+                continue
+            for l in range(world.lights.kind.shape[0]):  # noqa: E741
+                if aim_light(scratch.places, k, world.lights, l):
+                    scratch.bright[k] += _worth(scratch, world, l, k)
+
+
+@inlined
+def _find_torn(scratch: QuietScratch, world: World, l: int, wide: int, tall: int) -> bool:  # noqa: E741
+    """Ask in the corners of all cells whether a light's rim is seen in part, and where it is in those of their
+    quarters: a neighbour's single ray finds the last twentieth of a light by chance, and deep half shadows would have
+    ragged borders. Whether it is anywhere."""
+    if world.lights.casts_shadow[l] == 0 or not has_rim(world.lights, l):
+        return False
+    for k in range(_SPAN * _SPAN):
+        scratch.torn[k] = 0
+    torn = False
+    for j in range(0, tall + 1, _CELL):
+        for i in range(0, wide + 1, _CELL):
+            if _worth(scratch, world, l, _place(i, j)) > _FAINT * scratch.bright[_place(i, j)]:
+                torn = _ask_rim(scratch, world, l, i, j) or torn
+    if not torn:
+        return False
     half = _CELL // 2
     for y in range(0, tall, _CELL):
         for x in range(0, wide, _CELL):
@@ -337,16 +367,17 @@ def _find_torn(scratch: QuietScratch, world: World, l: int, wide: int, tall: int
                     i, j = x + part % 3 * half, y + part // 3 * half
                     if (i % _CELL != 0 or j % _CELL != 0) and i <= wide and j <= tall:
                         _ask_rim(scratch, world, l, i, j)
+    return True
 
 
 @inlined
-def _ask_rim(scratch: QuietScratch, world: World, l: int, i: int, j: int) -> None:  # noqa: E741
-    """Note whether a place sees a part of a light, and a part not."""
+def _ask_rim(scratch: QuietScratch, world: World, l: int, i: int, j: int) -> bool:  # noqa: E741
+    """Note and return whether a place sees a part of a light, and a part not."""
     # Corners beside each other, of cells as of quarters, look at other points.
     k, turn = _place(i, j), (i // _CELL + j // _CELL + i // (_CELL // 2) + j // (_CELL // 2)) % 2
     packet, found = scratch.looking.packet, row(scratch.found, k)
     if scratch.part[k] < 0 or found[0] < 0.0 or scratch.torn[k] != 0:
-        return
+        return scratch.torn[k] > 0
     scratch.torn[k] = -1
     clear(packet)
     for lane in range(LANES):
@@ -355,6 +386,7 @@ def _ask_rim(scratch: QuietScratch, world: World, l: int, i: int, j: int) -> Non
     for lane in range(LANES):
         if packet.valid[lane] != 0 and _largest(sub(row(scratch.free, lane), found)) > _STEP_OF_LAMP:
             scratch.torn[k] = 1
+    return scratch.torn[k] > 0
 
 
 @inlined
@@ -372,8 +404,8 @@ def _is_torn(scratch: QuietScratch, first: int, side: int, part: int) -> bool:
 def _is_between(scratch: QuietScratch, i: int, j: int) -> bool:
     """A place lies in a cell, and in a quarter of it, with a corner on its surface that sees a part of the light."""
     half, part = _CELL // 2, scratch.part[_place(i, j)]
-    return _is_torn(scratch, _place(i // _CELL * _CELL, j // _CELL * _CELL), _CELL, part) and _is_torn(
-        scratch, _place(i // half * half, j // half * half), half, part
+    return _is_torn(scratch, _place(i // half * half, j // half * half), half, part) and _is_torn(
+        scratch, _place(i // _CELL * _CELL, j // _CELL * _CELL), _CELL, part
     )
 
 
