@@ -1,4 +1,5 @@
-"""What hatchling does beyond copying files: it compiles the kernels into the wheel, so that no user has to wait for it.
+"""What hatchling does beyond copying files: it compiles the kernels into the wheel, so that no user has to wait for it,
+and writes a description that can be read without the repository.
 
 Where that cannot be done (another platform, no C compiler, no numba in the build) the wheel has no kernels in it, and
 numba compiles them when they are first called. An editable install is such a case: its sources are going to change.
@@ -16,7 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+from hatchling.metadata.plugin.interface import MetadataHookInterface
 
+_LINK = re.compile(r"(?P<picture>!?)\[(?P<words>[^\]]*)\]\((?!https?://|#)[^)]*\)")
+"""A link of Markdown to a file beside it."""
 _IN_WHEEL = "refract_core/kernels/built"
 
 
@@ -67,3 +71,18 @@ def platform_tag(library: bytes) -> str:
     if not versions:
         return "linux_x86_64"
     return "manylinux_{}_{}_x86_64".format(*max(versions))
+
+
+class CustomMetadataHook(MetadataHookInterface):
+    """Makes the README the description that a package index shows, far from the files that it links to."""
+
+    def update(self, metadata: dict[str, Any]) -> None:
+        """Called for every wheel and every archive of sources."""
+        text = Path(self.root, "README.md").read_text(encoding="utf-8")
+        metadata["readme"] = {"content-type": "text/markdown", "text": alone(text)}
+
+
+def alone(markdown: str) -> str:
+    """The same without links to files beside it, of which the words stay, and without its pictures. The project has no
+    address that they could be made absolute by."""
+    return _LINK.sub(lambda found: "" if found["picture"] else found["words"], markdown)

@@ -116,6 +116,23 @@ def test_links_inside_the_pages_lead_somewhere() -> None:
     assert lost == []
 
 
+def test_the_description_of_the_wheel_is_the_readme_without_links_to_files_beside_it() -> None:
+    """A package index has no such files. Words of links, code and everything else stay."""
+    from hatchling.metadata.core import ProjectMetadata
+    from hatchling.plugin.manager import PluginManager
+
+    readme = (ROOT / "README.md").read_text("utf-8")
+    told = ProjectMetadata(str(ROOT), PluginManager()).core.readme
+    pictures, links = (re.findall(rf"{mark}\[([^\]]*)\]\((?!https)[^)]*\)", readme) for mark in ("!", "(?<!!)"))
+    assert pictures
+    assert links
+    assert not re.search(r"\]\((?!https?://|#)", told)
+    assert [words for words in links if words not in told] == []
+    assert [words for words in pictures if words in told] == []
+    plain = [line for line in readme.splitlines() if line and "](" not in line]
+    assert [line for line in told.splitlines() if line in plain] == plain
+
+
 def test_every_block_says_what_it_is() -> None:
     """Blocks that run are `sh` or `python`; output and grammar are `text`, stages are `usda`, settings `json`."""
     known = {"sh", "python", "text", "usda", "json", "toml"}
